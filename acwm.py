@@ -23,23 +23,23 @@ from typing import TYPE_CHECKING, Any, overload
 import gymnasium
 
 from acwm_core import __version__
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 
 if TYPE_CHECKING:
-    from acwm_core.assembly import build_world_model
     from acwm_core.data.card import DatasetCard
     from acwm_core.data.episodes import ClipDataset, EpisodeDataset
     from acwm_core.data.generate import generate
-    from acwm_core.environment import Environment
+    from acwm_core.env.environment import Environment
+    from acwm_core.env.task import Task, TaskEnvironment
     from acwm_core.errors import AcwmError
     from acwm_core.evaluation.evaluate import evaluate_run as evaluate
-    from acwm_core.planning.planner import Planner
-    from acwm_core.planning.task import Task, TaskEnvironment
+    from acwm_core.model.build import build_world_model
+    from acwm_core.model.world_model import WorldModel
+    from acwm_core.plugins import Component
     from acwm_core.recipe import Recipe, compose
-    from acwm_core.registry import Component
     from acwm_core.training.launch import fit
     from acwm_core.training.run import load_run as load
-    from acwm_core.world_model import WorldModel
+    from acwm_planning.planner import Planner
 
 __all__ = [
     "AcwmError",
@@ -66,8 +66,8 @@ _HOMES = {
     "ClipDataset": "acwm_core.data.episodes:ClipDataset",
     "EpisodeDataset": "acwm_core.data.episodes:EpisodeDataset",
     "Recipe": "acwm_core.recipe:Recipe",
-    "WorldModel": "acwm_core.world_model:WorldModel",
-    "build_world_model": "acwm_core.assembly:build_world_model",
+    "WorldModel": "acwm_core.model.world_model:WorldModel",
+    "build_world_model": "acwm_core.model.build:build_world_model",
     "compose": "acwm_core.recipe:compose",
     "evaluate": "acwm_core.evaluation.evaluate:evaluate_run",
     "fit": "acwm_core.training.launch:fit",
@@ -144,7 +144,7 @@ def make_planner(name: str, **params: Any) -> Planner:
     Raises:
         UnknownNameError: no such planner.
     """
-    from acwm_core.planning.planner import Planner  # imports torch
+    from acwm_planning.planner import Planner  # imports torch
 
     return catalog().component("planner", name).create_as(Planner, **params)
 
@@ -185,7 +185,7 @@ def _make(name: str, *, task: str | None = None, **params: Any) -> Any:
     component = catalog().component("environment", name)
     if task is None:
         return component.create(**params)
-    from acwm_core.planning.task import TaskEnvironment
+    from acwm_core.env.task import TaskEnvironment
 
     return TaskEnvironment(component.create(**params), component.load_task(task))
 

@@ -20,10 +20,10 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.plugins import catalog
+from acwm_core.recipe.check import check_component
 from acwm_core.recipe.compose import merge, parse_override
-from acwm_core.recipe.validate import check_component
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

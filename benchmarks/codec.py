@@ -20,11 +20,11 @@ from codec_pictures import picture
 from PIL import Image
 from torch import Tensor
 
-from acwm_core.catalog import catalog
-from acwm_core.codec import Codec
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.episode import Split
+from acwm_core.env.episode import Split
+from acwm_core.model.codec import Codec
+from acwm_core.plugins import catalog
 
 ENVIRONMENTS = (
     "push_cube",

@@ -20,9 +20,9 @@ from rich.table import Table
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Episode, Split
+from acwm_core.env.episode import Episode, Split
+from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import AcwmError
-from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_estimators.layout import Layout, layout_of
 from acwm_estimators.targets import MIN_SEEN, points_there, rows_of

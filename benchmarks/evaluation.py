@@ -29,21 +29,21 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.assembly import build_world_model
 from acwm_core.cli.arguments import size
-from acwm_core.codec import Codec
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.evaluation import evaluate, evaluator
 from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.metric import Metric, Rollout
 from acwm_core.evaluation.provenance import KEPT, REFERENCES
 from acwm_core.evaluation.results import FOLDER as EVALUATION
 from acwm_core.evaluation.results import Summary
-from acwm_core.metric import Metric, Rollout
+from acwm_core.model.build import build_world_model
+from acwm_core.model.codec import Codec
+from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import compose
 from acwm_core.training.run import save_weights
-from acwm_core.world_model import WorldModel
 
 REFERENCE = ", reference rows"
 SAMPLING, READING, CODEC = "sampling", "reading clips", "codec row"

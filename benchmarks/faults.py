@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.simulate import simulate
-from acwm_core.environment import Environment
-from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.env.environment import Environment
+from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError
 
 Fault = Callable[[Any], None]

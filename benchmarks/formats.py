@@ -35,7 +35,7 @@ from acwm_core.data.video import (
     encode_frames,
     plane_of,
 )
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 
 ENVIRONMENTS = ["push_cube", "push_sand", "pour_water"]
 FRAMES = 37

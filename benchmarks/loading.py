@@ -27,7 +27,6 @@ from loading_ways import Hdf5Windows, Mp4Windows, batches_of, webdataset_loader
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.catalog import catalog
 from acwm_core.data.encoding import encode_windows
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.generate import generate
@@ -35,6 +34,7 @@ from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.data.shards import open_shard
 from acwm_core.data.video import Limits, decode_into
+from acwm_core.plugins import catalog
 
 FRAMES, STRIDE, BATCH = 37, 4, 16
 GZIP = {"compression": "gzip", "compression_opts": 1, "shuffle": True}

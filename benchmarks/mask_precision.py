@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_estimators.layout import layout_of
 
 LARGER = 10

@@ -18,11 +18,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.catalog import catalog
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Split
+from acwm_core.env.episode import Split
+from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.metric import Metric
+from acwm_core.plugins import catalog
 from acwm_metrics.calibrate import true_rollout
 from acwm_metrics.plugin import PHYSICS
 

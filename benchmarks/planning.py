@@ -24,16 +24,16 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
 from acwm_core.data.simulate import make_environment
-from acwm_core.episode import EpisodeSpec
-from acwm_core.evaluation.planning.settings import settings_of
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import TaskEnvironment
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.planning.task import TaskEnvironment
-from acwm_core.world_model import WorldModel
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.run import make_cost, make_planner
+from acwm_planning.settings import settings_of
 
 PLANNERS = ("random_shooting", "cem", "icem", "mppi", "gradient")
 SHARES = ("encode", "predict", "decode", "estimate")

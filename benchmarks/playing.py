@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 
 WARM_UP = 5.0
 """Seconds that are not measured."""

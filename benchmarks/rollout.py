@@ -25,10 +25,10 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn import functional
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
-from acwm_core.flow import Flow
-from acwm_core.world_model import CLIP_FRAMES, WorldModel
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import CLIP_FRAMES, WorldModel
+from acwm_core.plugins import catalog
 
 ACTION_SIZE = 2
 

@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 
 CHILD = Path(__file__).with_name("simulate_one.py")
 GYMNASIUM = "gymnasium"

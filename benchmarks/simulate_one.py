@@ -18,8 +18,8 @@ import numpy as np
 
 from acwm_core.data.shards import write_shard
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import Environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.environment import Environment
+from acwm_core.env.episode import EpisodeSpec
 
 GYMNASIUM = "gymnasium"
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.stats import binomtest
 
-from acwm_core.catalog import catalog
-from acwm_core.episode import EpisodeSpec
-from acwm_core.planning.task import TaskEnvironment
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import TaskEnvironment
+from acwm_core.plugins import catalog
 
 SEED = 22
 """Seed of the episodes, which are number 0, 1, … of `ind_test`."""

@@ -8,7 +8,7 @@ import torch
 from published_dit import PublishedDiT
 from torch import Tensor, nn
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 
 CHANNELS, ACTION_SIZE, STRIDE, PATCH = 16, 2, 4, 2
 

@@ -19,11 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import Episode, EpisodeSpec
-from acwm_core.estimator import StateEstimator
+from acwm_core.env.episode import Episode, EpisodeSpec
+from acwm_core.env.physics import StateEstimator
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.metric import Rollout
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.metric import Rollout
 from acwm_metrics.calibrate import true_rollout
 from acwm_metrics.conservation import violations
 

@@ -21,7 +21,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder, load_run, read_metadata
-from acwm_data.preview import Picture, below, beside, magnified
+from acwm_formats.preview import Picture, below, beside, magnified
 from acwm_zoo.shipped import folder, shipped
 
 SPLITS = ("ind_test", "ood_test")

@@ -6,9 +6,9 @@ The overview is part of the page; the site adds a section on every environment.
 import inspect
 from pathlib import Path
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
+from acwm_core.env.episode import Factor
+from acwm_core.plugins import catalog
 
 PLUGINS = Path(__file__).resolve().parent.parent / "plugins"
 

@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, he
 
 import pytest
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 from tests.browsing import chromium
 
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them send.
@@ -73,6 +73,6 @@ def fresh_catalog():
     yield
     catalog.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("acwm_core.catalog.Catalog", lambda: before)
+        patch.setattr("acwm_core.plugins.Catalog", lambda: before)
         patch.setattr(before, "load_entry_points", lambda: None)
         assert catalog() is before

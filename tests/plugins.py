@@ -2,7 +2,7 @@
 
 import os
 
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import hookimpl
 
 
 def plugin_of(**components):

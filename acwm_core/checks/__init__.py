@@ -14,35 +14,24 @@ from acwm_core.checks.codec import CodecChecks
 from acwm_core.checks.conditioner import ConditionerChecks
 from acwm_core.checks.environment import EnvironmentChecks
 from acwm_core.checks.estimator import EstimatorChecks
-from acwm_core.checks.formats import DatasetExporterChecks, DatasetImporterChecks
-from acwm_core.checks.importer import ImporterChecks
 from acwm_core.checks.metric import MetricChecks
 from acwm_core.checks.model import check_model
-from acwm_core.checks.planner import PlannerChecks
 from acwm_core.checks.result import CheckResult
 from acwm_core.checks.task import check_task
 
 check_codec = CodecChecks.check
 check_conditioner = ConditionerChecks.check
-check_dataset_exporter = DatasetExporterChecks.check
-check_dataset_importer = DatasetImporterChecks.check
 check_environment = EnvironmentChecks.check
 check_estimator = EstimatorChecks.check
-check_importer = ImporterChecks.check
 check_metric = MetricChecks.check
-check_planner = PlannerChecks.check
 
 __all__ = [
     "CheckResult",
     "check_codec",
     "check_conditioner",
-    "check_dataset_exporter",
-    "check_dataset_importer",
     "check_environment",
     "check_estimator",
-    "check_importer",
     "check_metric",
     "check_model",
-    "check_planner",
     "check_task",
 ]

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import moving_discs
-from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.shapes import Video
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Video
 
 
 class CodecChecks(Suite):
-    """Checks of an `acwm_core.codec.Codec` in evaluation mode, without gradients."""
+    """Checks of an `acwm_core.model.codec.Codec` in evaluation mode, without gradients."""
 
     kind = "codec"
 

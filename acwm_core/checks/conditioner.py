@@ -10,7 +10,7 @@ from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
-from acwm_core.conditioner import Conditioner, Conditioning, takes_widths
+from acwm_core.model.conditioner import Conditioner, Conditioning, takes_widths
 
 FIT = {"action_size": 3, "temporal_stride": 4, "width": 16, "layers": 2, "heads": 2}
 """Sizes of the environment, codec and model for which conditioners are built here."""
@@ -25,7 +25,7 @@ FAINT = 1e-5
 
 
 class ConditionerChecks(Suite):
-    """Checks of an `acwm_core.conditioner.Conditioner` by its effect on random tokens.
+    """Checks of an `acwm_core.model.conditioner.Conditioner` by its effect on random tokens.
 
     Weights are perturbed first: gates that start closed would hide the actions.
     """

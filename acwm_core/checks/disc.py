@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor, FactorValue
-from acwm_core.estimator import (
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor, FactorValue
+from acwm_core.env.physics import (
     Constant,
     Gap,
     Level,
@@ -21,7 +21,7 @@ from acwm_core.estimator import (
     StateEstimator,
     States,
 )
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
 
 RADIUS = 0.1  # in m; a frame is 1 m high
 WALL = 0.25  # in m from the middle

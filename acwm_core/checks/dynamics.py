@@ -11,12 +11,12 @@ from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Denoiser
-from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError
-from acwm_core.flow import Flow, Objective
-from acwm_core.shapes import Actions, Latent, Tokens
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.flow import Flow, Objective
+from acwm_core.model.shapes import Actions, Latent, Tokens
 
 SHAPE = (2, 4, 4, 8, 8)
 """B, L, C, h, w of the latents used in the checks."""

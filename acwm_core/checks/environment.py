@@ -16,15 +16,15 @@ from acwm_core.checks.result import expect, expect_equal, expect_is_a
 from acwm_core.checks.task import TaskChecks
 from acwm_core.checks.trial import BEGINNING
 from acwm_core.data.simulate import digests_elsewhere, simulate
-from acwm_core.environment import Environment, EnvironmentCard, Policy
-from acwm_core.episode import Episode, EpisodeSpec, Factor
+from acwm_core.env.environment import Environment, EnvironmentCard, Policy
+from acwm_core.env.episode import Episode, EpisodeSpec, Factor
 
 CLOSE = 0.01
 """Mean difference of two frames, as a fraction of white, that counts as hardly visible."""
 
 
 class EnvironmentChecks(TaskChecks):
-    """Checks of an `acwm_core.environment.Environment` on episodes of small frames.
+    """Checks of an `acwm_core.env.environment.Environment` on episodes of small frames.
 
     The last five check that an `EpisodeSpec` and actions determine every byte. One of them imports
     the environment in a fresh process, so it must be importable.

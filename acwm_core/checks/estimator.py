@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from acwm_core.checks.result import Checked, Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
-from acwm_core.estimator import Observation, Physics, StateEstimator
+from acwm_core.env.physics import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
 
 FRAMES = 24
 """Number of frames of the clip that is read."""
 
 
 class EstimatorChecks(Suite):
-    """Checks of an `acwm_core.estimator.StateEstimator` on a simulated clip of small frames.
+    """Checks of an `acwm_core.env.physics.StateEstimator` on a simulated clip of small frames.
 
     Args:
         environment: the environment it reads, a registered name or a class; by default the

@@ -13,21 +13,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.disc import Disc, DiscEstimator
 from acwm_core.checks.result import Checked, CheckResult, Suite, expect, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
-from acwm_core.environment import EnvironmentCard
-from acwm_core.estimator import StateEstimator
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.metric import Metric, Reads, Rollout, SetMetric
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.metric import Metric, Reads, Rollout, SetMetric
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
+from acwm_core.plugins import catalog
 
 
 class MetricChecks(Suite):
-    """Checks of every `acwm_core.metric.Metric` on a clip with good and bad predictions.
+    """Checks of every `acwm_core.evaluation.metric.Metric` on a clip with good and bad predictions.
 
     Args:
         component: a registered name, or the class.

@@ -13,18 +13,18 @@ from torch import Tensor
 from acwm_core.checks.dynamics import DynamicsChecks, Probe
 from acwm_core.checks.result import CheckResult, Suite, expect, expect_equal, run_checks
 from acwm_core.checks.trial import batch_error, noise, shaken
-from acwm_core.conditioner import Conditioning
-from acwm_core.denoiser import Denoiser
-from acwm_core.dynamics import Cache, DynamicsModel
 from acwm_core.errors import RecipeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.dynamics import Cache, DynamicsModel
 
 CHANNELS = 4
 
 
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
-    """Check a model against the contract of `acwm_core.dynamics.DynamicsModel`.
+    """Check a model against the contract of `acwm_core.model.dynamics.DynamicsModel`.
 
-    A denoiser is also checked against the contract of `acwm_core.denoiser.Denoiser`.
+    A denoiser is also checked against the contract of `acwm_core.model.denoiser.Denoiser`.
 
     Weights are perturbed first: many models start with zero layers, which would hide their inputs.
 

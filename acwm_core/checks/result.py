@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import PluginError
 from acwm_core.errors.plugin_code import explained, is_by_an_author, is_true_stop
-from acwm_core.registry import ComponentKind
+from acwm_core.plugins import ComponentKind, catalog
 
 Checked = str | Callable[..., Any]
 """The component to check: a registered name, or the class."""

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.result import CheckResult, expect, expect_equal, expect_is_a, run_checks
 from acwm_core.checks.trial import EnvironmentTrial
-from acwm_core.planning.task import Task, TaskEnvironment, observed
+from acwm_core.env.task import Task, TaskEnvironment, observed
+from acwm_core.plugins import catalog
 
 
 def check_task(name: str) -> Iterator[CheckResult]:
-    """Check a single registered task against the contract of `acwm_core.planning.task.Task`.
+    """Check a single registered task against the contract of `acwm_core.env.task.Task`.
 
     Args:
         name: ``ENVIRONMENT.TASK``.

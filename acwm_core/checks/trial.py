@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from acwm_core.checks.result import Suite
 from acwm_core.data.simulate import simulate
-from acwm_core.environment import Environment, EnvironmentCard
-from acwm_core.episode import Episode, EpisodeSpec, Split
-from acwm_core.shapes import Video
+from acwm_core.env.environment import Environment, EnvironmentCard
+from acwm_core.env.episode import Episode, EpisodeSpec, Split
+from acwm_core.model.shapes import Video
 
 Module = TypeVar("Module", bound=nn.Module)
 

@@ -5,7 +5,9 @@ import threading
 
 from acwm_core.cli.main import main
 from acwm_core.errors import handle_interrupts
-from acwm_core.evaluation.experiment import ENDS_WITH_INPUT
+
+ENDS_WITH_INPUT = "ACWM_ENDS_WITH_INPUT"
+"""Environment variable that makes a command end once its standard input is closed."""
 
 
 def end_with_input() -> None:

@@ -145,7 +145,7 @@ def split_parameters(
         The other overrides, and the checked parameters.
     """
     from acwm_core.executors import split_options
-    from acwm_core.recipe.validate import check_component, check_metric_params
+    from acwm_core.recipe.check import check_component, check_metric_params
 
     others, given = split_options(overrides, section)
     if section == "metric":

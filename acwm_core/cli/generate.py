@@ -12,7 +12,7 @@ from acwm_core.cli.arguments import OUT_FOLDER, renamed_option, size
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
-    from acwm_core.episode import FactorSetting
+    from acwm_core.env.episode import FactorSetting
 
 
 @click.command()
@@ -64,11 +64,11 @@ def generate(
     The same arguments give the same bytes, for any number of workers. If it is interrupted, run
     the same command again to continue. Another split is added to the folder.
     """
-    from acwm_core.catalog import catalog
     from acwm_core.data.generate import generate as generate_dataset
     from acwm_core.data.generate import parse_episodes
     from acwm_core.data.simulate import make_environment
     from acwm_core.executors import create_executor, split_options
+    from acwm_core.plugins import catalog
 
     out = out or Path("data", environment)
     others, options = split_options(overrides)

@@ -14,8 +14,8 @@ from typing import Any, NoReturn
 import click
 
 from acwm_core import __version__
-from acwm_core.catalog import catalog
-from acwm_core.cli.evaluate import evaluate
+from acwm_core.cli.components import check, list_components, show
+from acwm_core.cli.doctor import doctor
 from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
@@ -28,6 +28,7 @@ from acwm_core.errors import (
     suggest,
 )
 from acwm_core.errors.plugin_code import blaming
+from acwm_core.plugins import catalog
 from acwm_core.untrusted import printable
 
 
@@ -58,10 +59,12 @@ class AcwmGroup(click.Group):
         """Return a command; a command of a plugin is imported now."""
         found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
         command = brought[cmd_name].load() if found is None and cmd_name in brought else found
-        completions = catalog().registry("completion")
-        for parameter in command.params if command and ctx.resilient_parsing else ():
-            if parameter.name in completions:  # shell completion
-                parameter.shell_complete = completions[parameter.name].load()
+        if command and ctx.resilient_parsing:  # shell completion
+            from acwm_core.cli.completion import COMPLETIONS
+
+            for parameter in command.params:
+                if parameter.name in COMPLETIONS:
+                    parameter.shell_complete = COMPLETIONS[parameter.name]
         return command
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
@@ -166,5 +169,5 @@ def main() -> None:
     """
 
 
-for _command in (generate, fit, evaluate):
+for _command in (list_components, show, generate, fit, check, doctor):
     main.add_command(_command)

@@ -1,4 +1,4 @@
-"""The dataset card: how a dataset was made, what training reads from it, and its README."""
+"""The dataset card: how a dataset was made, and what training reads from it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from typing import Any, cast
 import yaml
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
 from acwm_core.recipe.recipe import flat_items
 from acwm_core.untrusted import MAX_YAML, PlainLoader, check_folder, read_bytes, typed
@@ -35,11 +35,6 @@ FORMAT = 1
 PADDING = "A clip that is longer than its episode repeats the last frame, with zero actions."
 """Holds for clips of a fixed length. Training cuts clips of short episodes to whole latent frames
 and pads only episodes too short for two of them: see `acwm_core.data.clips.clip_lengths`."""
-
-README = "README.md"
-MARK = "<!-- Made by acwm from card.yaml. Without this line acwm leaves the page as it is. -->"
-SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-"""Upper bounds of the Hugging Face hub's size categories, in episodes."""
 
 
 @dataclass(frozen=True)
@@ -213,57 +208,3 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
     return dict(flat_items(values))
-
-
-def write_readme(folder: Path, card: DatasetCard) -> None:
-    """Write ``folder/README.md`` for the finished splits, unless a user removed its `MARK`.
-
-    A dataset hub shows it: YAML for the hub, then Markdown for people. Equal datasets get equal
-    pages.
-    """
-    import jinja2
-
-    from acwm_core.data.manifest import Manifest  # imports PyAV, which a card does not need
-
-    def cell(text: object) -> str:
-        return str(text).replace("|", "\\|").replace("\n", " ")
-
-    path = folder / README
-    if path.exists() and MARK.encode() not in read_bytes(path):
-        return
-    pages = jinja2.Environment(
-        loader=jinja2.PackageLoader("acwm_core.data", "."),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    cast(Any, pages).filters["cell"] = cell
-    page = pages.get_template("readme.md.j2").render(
-        card=card,
-        environment=card.environment,
-        splits={split: Manifest(folder / split).ordered() for split in card.splits},
-        statistics=card.actions.get("train") or next(iter(card.actions.values()), None),
-        front_matter=_front_matter(card),
-        mark=MARK,
-    )
-    with written_whole(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-
-
-def _front_matter(card: DatasetCard) -> str:
-    """The YAML header that the Hugging Face hub reads."""
-    environment = card.environment
-    height, width = environment.frame_size
-    total = sum(card.splits.values())
-    files = [{"split": split, "path": f"{split}/*.tar"} for split in card.splits]
-    engine = [] if card.source else ["simulation", environment.engine.lower().replace(" ", "-")]
-    values = {
-        "pretty_name": f"{environment.name}, {height}×{width}",
-        "license": "unknown",
-        "task_categories": ["robotics", "image-to-video"],
-        "tags": ["world-model", "action-conditioned", "video", *engine, "webdataset", "acwm"],
-        "size_categories": [next((name for top, name in SIZES if total < top), "n>1M")],
-        "configs": [{"config_name": "default", "data_files": files}],
-    }
-    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)

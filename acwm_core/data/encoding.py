@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.codec import Codec
 from acwm_core.data.atomic import alone, writing, written_whole
 from acwm_core.data.clips import padded_video
 from acwm_core.data.episodes import EpisodeDataset
@@ -21,6 +20,7 @@ from acwm_core.data.latents import LatentFolder
 from acwm_core.errors import DamagedShardError, DataError
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.executors import Report, progress_bar
+from acwm_core.model.codec import Codec
 
 
 def encode_windows(

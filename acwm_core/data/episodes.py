@@ -19,7 +19,7 @@ from acwm_core.data.manifest import Manifest
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
 from acwm_core.data.video import Limits, decode_into, decode_planes
-from acwm_core.episode import Episode, Split
+from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError
 
 if TYPE_CHECKING:  # reading episodes needs no torch

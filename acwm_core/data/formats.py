@@ -22,7 +22,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.recordings import RecordedDataset
 from acwm_core.data.remote import data_folder
-from acwm_core.episode import Episode, Split
+from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import progress_bar
 

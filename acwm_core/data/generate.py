@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import LOCK, held, remove_partial, writing
-from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
+from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.manifest import Manifest, action_statistics, shard_name
+from acwm_core.data.readme import write_readme
 from acwm_core.data.simulate import (
     EpisodeSource,
     ShardTask,
@@ -23,10 +23,11 @@ from acwm_core.data.simulate import (
     make_shard,
     simulated,
 )
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
 from acwm_core.executors import Executor, LocalExecutor, progress_bar
+from acwm_core.plugins import catalog
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""

@@ -21,12 +21,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.codec import Codec
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.clips import common_length, window_actions, window_starts
 from acwm_core.data.episodes import Clips, EpisodeDataset
 from acwm_core.data.shards import UNREADABLE
 from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.model.codec import Codec
 from acwm_core.untrusted import parse_json, read_bytes
 
 LATENTS = "latents"

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.atomic import writing
-from acwm_core.data.card import DatasetCard, package_versions, write_readme
+from acwm_core.data.card import DatasetCard, package_versions
 from acwm_core.data.generate import fill
 from acwm_core.data.manifest import Manifest
-from acwm_core.environment import ActionSpec, EnvironmentCard, StateField
-from acwm_core.environment_card import check_episode
-from acwm_core.episode import SPLITS, Episode, EpisodeSpec, Split
+from acwm_core.data.readme import write_readme
+from acwm_core.env.card import check_episode
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
+from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.executors import LocalExecutor
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.video import Limits, decode_masks, decode_video, encode_masks, encode_video
-from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import AcwmError, DamagedShardError, DataError
 from acwm_core.untrusted import parse_json
 

@@ -18,18 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import ShardRecord
 from acwm_core.data.shards import open_shard, write_shard
-from acwm_core.environment import Environment
-from acwm_core.environment_card import check_episode
-from acwm_core.episode import Episode, EpisodeSpec, Split
+from acwm_core.env.card import check_episode
+from acwm_core.env.environment import Environment
+from acwm_core.env.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError, expect
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.executors import Report
-from acwm_core.registry import Component
+from acwm_core.plugins import Component, catalog
 
 EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
 

@@ -1,57 +1,13 @@
-"""What benchmark plugins provide: protocols and published tables. Does not import torch."""
+"""Published tables that benchmark plugins provide. Does not import torch."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
-from acwm_core.catalog import catalog
-from acwm_core.errors import AcwmError, AcwmWarning, RecipeError, suggest
-
-if TYPE_CHECKING:
-    from acwm_core.evaluation.config import EvaluationConfig
-    from acwm_core.evaluation.results import Summary
-
-FULL = "full"
-
-
-class Protocol:
-    """Chooses the test clips. This base class is the protocol ``full``: whole episodes.
-
-    Plugins register subclasses with the hook `register_protocols`. They are constructed without
-    arguments whenever a recipe is checked, so their modules should import nothing heavy.
-
-    Attributes:
-        defaults: values for settings of `EvaluationConfig` that are None.
-        cuts_windows: whether it cuts several clips from an episode, `evaluation.cuts` of them.
-        from_first_frame: whether every clip starts at its episode's first frame, so that its start
-            can be perturbed in the simulator.
-    """
-
-    defaults: Mapping[str, Any] = {}
-    cuts_windows: bool = False
-    from_first_frame: bool = True
-
-    def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
-        """Indices of the episodes to use, of `count` in a split, ascending; here the first ones."""
-        return list(range(min(count, config.episodes or count)))
-
-    def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
-        """The clips of an episode of `length` frames: first frame and number of frames of each."""
-        return [(0, min(length, config.frames or length))]
-
-
-def protocol_named(name: str) -> Protocol:
-    """The protocol with this name, or a `RecipeError` that suggests the closest name."""
-    if name == FULL:
-        return Protocol()
-    registry = catalog().registry("protocol")
-    if name not in registry:
-        known = suggest(name, [FULL, *(component.name for component in registry)])
-        raise RecipeError(f"evaluation.protocol: unknown {name!r}{known}")
-    return registry[name].create_as(Protocol)
+from acwm_core.errors import AcwmError, AcwmWarning
+from acwm_core.plugins import catalog
 
 
 @dataclass(frozen=True)
@@ -130,18 +86,3 @@ def published_for(setting: Mapping[str, str | float]) -> Published | None:
     near = [row for row in rows if row.setting["env"] == setting["env"]]
     found = next((row for row in near if row.setting == setting), near[0] if near else None)
     return Published(found, same_parts=found.setting == setting) if found else None
-
-
-def about_published(summary: Summary) -> str:
-    """Where the published figures of a run come from and how far they are comparable, as text."""
-    if not summary.published:
-        return ""
-    row, same = summary.published.row, summary.published.same_parts
-    setting = ", ".join(str(row.setting[name]) for name in ("model", "codec", "conditioner"))
-    facts = [f"published: {row.citation}, {row.label} ({setting})"]
-    if not same:
-        facts.append("this run has other components")
-    table = published_tables().get(row.table)  # none where its plugin is not installed
-    if table and table.protocol and summary.protocol != table.protocol:
-        facts.append(f"measured on other clips: compare with --protocol {table.protocol}")
-    return "; ".join(facts) + (f". {row.note}" if row.note else "")

@@ -15,10 +15,10 @@ import numpy as np
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
+from acwm_core.evaluation.metric import Metric, SetMetric
 from acwm_core.evaluation.replacing import result_file
 from acwm_core.evaluation.results import FOLDER, Scores, SplitSummary, StepsCurve, StepsPoint
-from acwm_core.metric import Metric, SetMetric
-from acwm_core.statistics import (
+from acwm_core.evaluation.statistics import (
     ClipScores,
     Estimate,
     Paired,
@@ -62,7 +62,7 @@ class ClipResult:
         weights: how much the clip counts in a metric's summary, by metric.
         curves: the score of each frame, by metric; NaN where it is not defined. Rounded to float32,
             as they are written.
-        features: features `[2, D]` of metrics that compare sets, see `acwm_core.metric.SetMetric`.
+        features: features `[2, D]` of metrics that compare sets, see `SetMetric`.
         failed: whether the prediction is not finite; then all scores are `Metric.worst`.
     """
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from acwm_core.data.clips import window_actions
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import SPLITS, Episode
+from acwm_core.env.episode import SPLITS, Episode
 from acwm_core.errors import DataError
-from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.shapes import Actions, Clip, Video
+from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.model.shapes import Actions, Clip, Video
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 """A row of the results, named after what made its prediction:

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from acwm_core.episode import SPLITS
+from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.evaluation.benchmark import protocol_named
+from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.recipe.compose import RENAMED
 from acwm_core.recipe.metrics import metric_configs
 from acwm_core.untrusted import parse_json, read_bytes

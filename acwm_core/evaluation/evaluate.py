@@ -18,8 +18,8 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import Split
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.clip_results import EPISODES, gap, summarise_split, write_results

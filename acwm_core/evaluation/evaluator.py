@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.denoiser import Denoiser
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.estimator import StateEstimator
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import PREDICTORS, Batch, ClipPlan, Predictor, batches, load_samples
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.results import VideoRecord
 from acwm_core.evaluation.scoring import (
     Prediction,
@@ -28,11 +28,11 @@ from acwm_core.evaluation.scoring import (
     quick_metrics,
     score,
 )
+from acwm_core.evaluation.statistics import finite
 from acwm_core.evaluation.videos import case_study
-from acwm_core.metric import Metric
-from acwm_core.shapes import Actions, Video
-from acwm_core.statistics import finite
-from acwm_core.world_model import WorldModel
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.shapes import Actions, Video
+from acwm_core.model.world_model import WorldModel
 
 Results = Mapping[str, list[ClipResult]]
 """Results by split."""

@@ -12,10 +12,10 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import Published
 from acwm_core.evaluation.facts import Environment, Name, Provenance, VideoFile
-from acwm_core.metric import MetricInfo as MetricInfo
-from acwm_core.statistics import Estimate as Estimate
-from acwm_core.statistics import Paired as Paired
-from acwm_core.statistics import defined as defined
+from acwm_core.evaluation.metric import MetricInfo as MetricInfo
+from acwm_core.evaluation.statistics import Estimate as Estimate
+from acwm_core.evaluation.statistics import Paired as Paired
+from acwm_core.evaluation.statistics import defined as defined
 from acwm_core.untrusted import check_folder, read_json
 
 FOLDER = "evaluation"
@@ -221,7 +221,7 @@ class Summary:
         environment: name, fps, action names, units and bounds.
         videos: the videos in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
-        protocol: which clips were predicted, see `acwm_core.evaluation.benchmark.Protocol`.
+        protocol: which clips were predicted, see `acwm_core.evaluation.protocol.Protocol`.
         left_out: metrics of the recipe and tests that could not be measured, and why.
         published: published scores of the same setting or environment; None if there are none.
     """

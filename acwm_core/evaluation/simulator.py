@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import ActionSpec, Environment
+from acwm_core.env.environment import ActionSpec, Environment
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.evaluation.benchmark import protocol_named
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, as_clip, cut_episode, load_samples
 from acwm_core.evaluation.counterfactual import (
@@ -26,10 +25,11 @@ from acwm_core.evaluation.counterfactual import (
     ratio,
 )
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
+from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.evaluation.results import Counterfactual, Predictability
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
-from acwm_core.statistics import finite
-from acwm_core.world_model import CLIP_FRAMES
+from acwm_core.evaluation.statistics import finite
+from acwm_core.model.world_model import CLIP_FRAMES
 
 SIZES = (0.1, 0.5)
 """Shifts of one action dimension, as fractions of half its range."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
 
 PANEL = 256
 """Approximate height of a panel in pixels; frames are magnified by a whole factor."""

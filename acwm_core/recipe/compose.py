@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import DataError, RecipeError, suggest, with_new_names
+from acwm_core.plugins import catalog
 from acwm_core.recipe.text import parse
 from acwm_core.untrusted import MAX_YAML, read_bytes
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.plugins import catalog
 from acwm_core.recipe.signature import Signature, load, signature
 
 MetricChoice = str | Mapping[str, Any]

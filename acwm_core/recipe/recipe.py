@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from acwm_core.errors import RecipeError
+from acwm_core.recipe.check import validate
 from acwm_core.recipe.compose import COMPONENTS, read_recipe
 from acwm_core.recipe.text import dump
-from acwm_core.recipe.validate import validate
 
 FREE_TO_CHANGE = (
     "data.batch_size",
@@ -57,7 +57,7 @@ class Recipe:
         codec: the video autoencoder.
         model: the dynamics model.
         conditioner: how actions enter the model.
-        flow: keyword arguments of `acwm_core.flow.Flow`.
+        flow: keyword arguments of `acwm_core.model.flow.Flow`.
         training: keyword arguments of `acwm_core.training.config.TrainingConfig`.
         data: keyword arguments of `acwm_core.data.clips.DataConfig`.
         evaluation: keyword arguments of `acwm_core.evaluation.config.EvaluationConfig`.

@@ -20,7 +20,7 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import TrainingError
-from acwm_core.shapes import Video
+from acwm_core.model.shapes import Video
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.optimizers import gradient_norm, total_norm
 from acwm_core.training.run import RunFolder, save_weights

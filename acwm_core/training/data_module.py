@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from acwm_core.codec import Codec
 from acwm_core.data.clips import DataConfig, hold_out, take_fraction
 from acwm_core.data.encoding import encode_windows
 from acwm_core.data.episodes import ClipDataset, Clips, EpisodeDataset
@@ -21,6 +20,7 @@ from acwm_core.data.latents import LatentClipDataset, compresses
 from acwm_core.data.loader import Fetching, Replacements, ResumableLoader
 from acwm_core.data.streaming_reader import StreamingLoader
 from acwm_core.errors import AcwmWarning, DataError, TrainingError
+from acwm_core.model.codec import Codec
 
 NOT_RESUMABLE = (
     "data.reader=webdataset cannot continue exactly: a resumed run sees the clips in another order "

@@ -15,14 +15,15 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 from torch.distributed import DistBackendError
 
-from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.data.remote import data_folder
-from acwm_core.environment import resolve_size
+from acwm_core.env.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.model.build import build_world_model
+from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.callbacks import (
     LastCheckpoint,
@@ -49,7 +50,6 @@ from acwm_core.training.threads import found_threads
 from acwm_core.training.trained import find_run
 from acwm_core.training.trainer import build_trainer
 from acwm_core.untrusted import check_folder
-from acwm_core.world_model import WorldModel
 
 AUTO = "auto"
 """Value of `resume`: resume if there is something to resume, else start a new run."""

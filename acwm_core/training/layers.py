@@ -11,7 +11,7 @@ from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
 
 from acwm_core.errors import TrainingError
-from acwm_core.world_model import WorldModel
+from acwm_core.model.world_model import WorldModel
 
 
 def layers_of(module: nn.Module) -> Iterator[nn.Module]:

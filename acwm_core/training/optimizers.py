@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
-from acwm_core.dynamics import hidden_matrices
 from acwm_core.errors import AcwmWarning
 from acwm_core.errors.plugin_code import blaming
+from acwm_core.model.dynamics import hidden_matrices
+from acwm_core.model.world_model import WorldModel
 from acwm_core.training.config import TrainingConfig
-from acwm_core.world_model import WorldModel
 
 
 def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:

@@ -15,16 +15,16 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from acwm_core.assembly import build_world_model
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
+from acwm_core.model.build import build_world_model
+from acwm_core.model.shapes import check_finite
+from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
-from acwm_core.shapes import check_finite
 from acwm_core.training.trained import find_run, trained_models
 from acwm_core.untrusted import check_folder, parse_json, typed
-from acwm_core.world_model import WorldModel
 
 FORMAT = 1
 """Version of the metadata of `model.safetensors`."""

@@ -17,7 +17,8 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.shapes import Actions, Latent, Video
+from acwm_core.model.shapes import Actions, Latent, Video
+from acwm_core.model.world_model import WorldModel
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.layers import recompute_activations, shard, trained_layers
@@ -29,7 +30,6 @@ from acwm_core.training.optimizers import (
     update_average,
 )
 from acwm_core.training.restoring import check_moments, keep_own_files
-from acwm_core.world_model import WorldModel
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 """Separate random streams, so that validation never repeats the noise of a training step."""

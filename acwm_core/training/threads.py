@@ -14,9 +14,9 @@ import lightning as L
 import torch
 
 from acwm_core.errors.plugin_code import blaming
+from acwm_core.model.world_model import WorldModel
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.task import check_gradient
-from acwm_core.world_model import WorldModel
 
 SECONDS = 1.0
 """How long each number of threads is tried, if a step takes less."""

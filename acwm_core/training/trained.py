@@ -7,9 +7,9 @@ import inspect
 import shutil
 from pathlib import Path
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import alone, made_whole, writing
 from acwm_core.errors import TrainingError
+from acwm_core.plugins import catalog
 
 COPIES = Path("runs", "trained")
 """Folder for results of trained models, whose own folder may be part of a package."""

@@ -10,10 +10,9 @@ from typing import Any, cast
 
 from tables import cell, code, table
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import COMPONENT_KINDS, Component, catalog
+from acwm_core.recipe.check import FITTED, SECTIONS
 from acwm_core.recipe.signature import ModuleSource, Parameter, load, signature
-from acwm_core.recipe.validate import FITTED, SECTIONS
-from acwm_core.registry import COMPONENT_KINDS, Component
 
 IN_RECIPES = {
     "environment": "env",

@@ -12,8 +12,8 @@
 import numpy as np
 from PIL import Image
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
-from acwm_core.episode import EpisodeSpec, Factor
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
+from acwm_core.env.episode import EpisodeSpec, Factor
 
 # %% [markdown]
 # ## The card
@@ -126,10 +126,9 @@ picture
 # A package registers its environment with an entry point. A notebook adds it to the catalog.
 
 # %%
-from acwm_core.catalog import catalog
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import catalog, hookimpl
 
 
 class Plugin:

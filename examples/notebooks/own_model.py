@@ -12,12 +12,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from acwm_core.assembly import build_world_model
-from acwm_core.catalog import catalog
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.dynamics import DynamicsModel
-from acwm_core.hooks import hookimpl
+from acwm_core.model.build import build_world_model
+from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import compose
 
 torch.manual_seed(0)

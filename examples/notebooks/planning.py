@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image
 
 import acwm
-from acwm_core.evaluation.planning.settings import settings_of
 from acwm_planning.run import Bench
+from acwm_planning.settings import settings_of
 
 # %% [markdown]
 # ## A task

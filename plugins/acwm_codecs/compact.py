@@ -15,9 +15,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from acwm_core.codec import Codec
 from acwm_core.errors import DataError
-from acwm_core.shapes import Latent, Video, check_finite
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Latent, Video, check_finite
 
 PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acwm_codecs.compact import Compact
-from acwm_core.shapes import Latent, Video
+from acwm_core.model.shapes import Latent, Video
 
 
 class CompactPerFrame(Compact):

@@ -13,9 +13,9 @@ from diffusers.models.autoencoders.autoencoder_tiny import AutoencoderTiny
 from torch import Tensor
 
 from acwm_codecs.pretrained import fingerprint, load_autoencoder
-from acwm_core.codec import Codec
 from acwm_core.errors import DataError
-from acwm_core.shapes import Latent, Video
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Latent, Video
 
 FRAMES_AT_ONCE = 4
 """Frames per pass through the network, so that long clips need no more memory than short ones."""

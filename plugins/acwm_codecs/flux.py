@@ -7,8 +7,8 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import Tensor
 
 from acwm_codecs.pretrained import fingerprint, load_autoencoder
-from acwm_core.codec import Codec
-from acwm_core.shapes import Latent, Video
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Latent, Video
 
 HUB = "black-forest-labs/FLUX.1-dev"
 """The default repository; its folder `vae` is used. Users must accept its licence on the Hub."""

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from acwm_core.codec import Codec
 from acwm_core.errors import RecipeError
-from acwm_core.shapes import Latent, Video
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Latent, Video
 
 CENTRE, SPREAD = 0.5, 0.25
 """Pixels become (value − CENTRE) / SPREAD, which is about zero mean and unit variance usually."""

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.shapes import check_finite
+from acwm_core.model.shapes import check_finite
 from acwm_core.untrusted import parse_json, read_bytes
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"

@@ -27,7 +27,7 @@ from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import DataError
-from acwm_core.shapes import check_finite
+from acwm_core.model.shapes import check_finite
 from acwm_core.untrusted.weights import training_record
 
 CROP = 64

@@ -13,9 +13,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_codecs.pretrained import build, fingerprint, first_line, load_autoencoder, load_strictly
-from acwm_core.codec import Codec, FrameDecoder
 from acwm_core.errors import DataError
-from acwm_core.shapes import Latent, Video
+from acwm_core.model.codec import Codec, FrameDecoder
+from acwm_core.model.shapes import Latent, Video
 
 HUB = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
 """The default repository; its folder `vae` is used."""

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_drawing import CLOTH_ID, HAND_ID, SPHERE_ID, ClothDrawing
 from acwm_deformable.cloth_policy import Carrier, TwoArms

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from acwm_core.estimator import Constant, Gap, Observation, Physics, Reading, States
+from acwm_core.env.physics import Constant, Gap, Observation, Physics, Reading, States
 from acwm_sim.camera import Camera
 from acwm_sim.geometry import Array, distance, outer_radius, point_to_curve
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.rope import NODES, POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope

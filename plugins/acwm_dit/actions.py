@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.shapes import Actions, Modulation
+from acwm_core.model.shapes import Actions, Modulation
 from acwm_dit.linear import Linear
 
 Embedding = Literal["stacked", "convolutional"]

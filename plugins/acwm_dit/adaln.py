@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.shapes import Actions
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.shapes import Actions
 from acwm_dit.actions import Embedding, action_embedder
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_core.shapes import Modulation, Tokens
+from acwm_core.model.shapes import Modulation, Tokens
 from acwm_dit.attention import Rotation, attend
 from acwm_dit.cache import LayerCache
 from acwm_dit.linear import Linear, linear_gelu

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from acwm_core.dynamics import Cache
+from acwm_core.model.dynamics import Cache
 from acwm_dit.attention import attend
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.errors import RecipeError
-from acwm_core.shapes import Actions, Tokens
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.shapes import Actions, Tokens
 from acwm_dit.actions import Embedding, action_embedder
 from acwm_dit.attention import attend
 from acwm_dit.linear import Linear

@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from acwm_core.conditioner import Conditioning
-from acwm_core.denoiser import Denoiser
-from acwm_core.dynamics import Cache
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.shapes import Latent, Modulation, Sigmas
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.dynamics import Cache
+from acwm_core.model.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
 from acwm_dit.blocks import FinalLayer, Layer
 from acwm_dit.cache import TemporalCache

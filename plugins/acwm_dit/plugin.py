@@ -1,7 +1,6 @@
 """Registers the sizes of the DiT, the conditioners, and the importer of published checkpoints."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 SIZES = {
     "dit_xs": (128, 3, 2, "1.9 M parameters: trains on a CPU in minutes"),
@@ -34,14 +33,4 @@ def register_conditioners(registry: Registry) -> None:
         "cross_attention",
         "acwm_dit.cross_attention:CrossAttention",
         summary="gated attention from the tokens of a frame to its action, after every layer",
-    )
-
-
-@hookimpl
-def register_importers(registry: Registry) -> None:
-    """Register the importer of published weights."""
-    registry.add(
-        "published_dit",
-        "acwm_dit.checkpoint:PublishedCheckpoint",
-        summary="training checkpoints of the published ACWM-DiT (latest.pt)",
     )

@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Split
+from acwm_core.env.episode import Split
+from acwm_core.env.physics import Observation, StateEstimator
+from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.estimator import Observation, StateEstimator
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.planning.task import Goal, Task, judged
-from acwm_core.streaming import Stream
+from acwm_core.model.stream import Stream
+from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (
     DatasetStarts,

@@ -1,7 +1,6 @@
-"""Registers the environment made from a model."""
+"""Registers the environment made from a model, and `acwm rollout`."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
@@ -11,4 +10,12 @@ def register_gymnasium_environments(registry: Registry) -> None:
         "dream",
         "acwm_dream.environment:Dream",
         summary="an environment made of a world model: run=RUN, task=TASK",
+    )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add `acwm rollout`, after the commands that measure how good a model is."""
+    registry.add(
+        "rollout", "acwm_dream.commands:rollout", summary="predict one video", after="rank"
     )

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.planning.task import Goal, Task, TaskEnvironment
 
 
 class Start(NamedTuple):

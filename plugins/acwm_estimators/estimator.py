@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import Observation, Physics, StateEstimator
 from acwm_core.errors import ShapeError, UnknownNameError
-from acwm_core.estimator import Observation, Physics, StateEstimator
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
+from acwm_core.plugins import catalog
 from acwm_estimators.curve import evenly, trace
 from acwm_estimators.layout import Curve, layout_of
 from acwm_estimators.limits import limits_fingerprint, physics_of

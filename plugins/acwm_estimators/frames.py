@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Episode
+from acwm_core.env.episode import Episode
 from acwm_estimators.layout import Layout
 from acwm_estimators.targets import targets_of
 
@@ -82,7 +82,7 @@ def reconstructed(frames: Frames, codec: Any, clips: int, length: int) -> Frames
 
     Args:
         frames: frames of one dataset.
-        codec: an `acwm_core.codec.Codec`.
+        codec: an `acwm_core.model.codec.Codec`.
         clips: number of clips.
         length: frames per clip, ``1 + 4k``.
     """

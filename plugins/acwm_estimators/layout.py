@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Literal
 
+from acwm_core.env.physics import ViewingCamera
 from acwm_core.errors import PluginError
-from acwm_core.estimator import ViewingCamera
 from acwm_estimators.limits import ideal_physics_of
 from acwm_estimators.plugin import WEIGHTS
 

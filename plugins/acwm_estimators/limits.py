@@ -13,8 +13,8 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
-from acwm_core.catalog import catalog
-from acwm_core.estimator import Gap, Physics
+from acwm_core.env.physics import Gap, Physics
+from acwm_core.plugins import catalog
 from acwm_estimators.plugin import WEIGHTS
 
 Limits = Mapping[str, float]

@@ -1,7 +1,6 @@
 """Registers an estimator for every environment whose weights ship with the package."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 TRAINED = (
     "cloth_move",

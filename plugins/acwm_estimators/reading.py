@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_estimators.curve import same_end_first
 from acwm_estimators.layout import Curve, Layout, Local, Points
 from acwm_estimators.targets import MIN_SEEN, points_there

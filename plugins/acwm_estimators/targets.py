@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import EnvironmentCard
-from acwm_core.estimator import ViewingCamera
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import ViewingCamera
 from acwm_estimators.layout import Layout, Local, Points
 from acwm_estimators.turns import encode_angle, encode_axes, heading
 

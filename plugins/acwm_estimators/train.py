@@ -21,9 +21,9 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.plugins import catalog
 from acwm_estimators.frames import Frames, draw, load_frames, reconstructed
 from acwm_estimators.layout import layout_of
 from acwm_estimators.losses import losses

@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from acwm_core.errors import DataError
-from acwm_core.shapes import check_finite
+from acwm_core.model.shapes import check_finite
 from acwm_estimators.network import StateNetwork
 
 FOLDER = Path(__file__).parent / "weights"

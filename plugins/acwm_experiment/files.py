@@ -12,11 +12,11 @@ from typing import Any, cast, get_type_hints
 import click
 
 from acwm_core.cli.arguments import seed_numbers
-from acwm_core.episode import SPLITS
+from acwm_core.env.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe, read_recipe
 from acwm_core.recipe.types import checked
+from acwm_experiment.table import Experiment, ExperimentCell
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe.compose import find_recipe
 from acwm_experiment.files import ExperimentFile, checked_seeds
+from acwm_experiment.table import Experiment, ExperimentCell
 
 COMMA = re.compile(r",(?![^\[{(]*[\]})])")
 """A comma that separates values, not one within brackets."""

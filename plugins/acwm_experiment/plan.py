@@ -7,44 +7,13 @@ from pathlib import Path
 
 from acwm_core.data.card import CARD
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, recipe_folder
 from acwm_experiment.files import DataChoice, ExperimentFile, slug
 from acwm_experiment.logs import StepLogs
+from acwm_experiment.runs import PlannedDataset, PlannedRun
+from acwm_experiment.table import Experiment, ExperimentCell
 from acwm_experiment.tasks import TaskPlan, planned_tasks
-
-
-@dataclass(frozen=True)
-class PlannedDataset:
-    """A dataset to train and test on."""
-
-    path: Path  # its folder
-    environment: str  # the environment to simulate
-    choice: DataChoice  # how to simulate it if the dataset does not exist
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One training and its evaluation."""
-
-    folder: Path  # the run folder
-    title: str  # readable name of the cell and seed
-    arguments: tuple[str, ...]  # recipe and overrides for `acwm fit`
-    recipe: Recipe  # the recipe composed from them
-    # the dataset that it needs; None for the user's own data or data behind a URL
-    dataset: PlannedDataset | None
-
-    @property
-    def max_steps(self) -> int:
-        """The number of optimiser steps of the training."""
-        return self.recipe.trainer["max_steps"]
-
-    @property
-    def gpus(self) -> int:
-        """The number of GPUs per node in the recipe; 0 if it gives no number."""
-        accelerator, devices = (self.recipe.trainer.get(k) for k in ("accelerator", "devices"))
-        return max(devices, 0) if accelerator in ("gpu", "cuda") and isinstance(devices, int) else 0
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
-from acwm_core.evaluation.experiment import FILE, Experiment
 from acwm_core.executors import BatchExecutor, JobState, available_cores, create_executor
 from acwm_experiment.local import LocalRunner
 from acwm_experiment.plan import Plan
 from acwm_experiment.steps import Step, all_progress, all_steps, step_progress
+from acwm_experiment.table import FILE, Experiment
 
 Say = Callable[[str], None]
 """Prints a line for the user."""

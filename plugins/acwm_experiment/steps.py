@@ -8,20 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.episode import SPLITS
+from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
-from acwm_core.evaluation.experiment import FILE, SUMMARY
-from acwm_core.evaluation.planning.tasks import SUMMARY as PLAN_SUMMARY
 from acwm_core.executors import Job
+from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes
 from acwm_experiment.files import slug
-from acwm_experiment.plan import Plan, PlannedDataset, PlannedRun
+from acwm_experiment.plan import Plan
+from acwm_experiment.runs import PlannedDataset, PlannedRun
+from acwm_experiment.table import FILE, SUMMARY
 from acwm_experiment.tasks import TaskPlan
+from acwm_planning.planned import SUMMARY as PLAN_SUMMARY
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""

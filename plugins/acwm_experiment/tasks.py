@@ -6,19 +6,16 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.errors import AcwmError, RecipeError, suggest
-from acwm_core.evaluation.experiment import Experiment
-from acwm_core.evaluation.planning.settings import settings_of
-from acwm_core.evaluation.planning.tasks import PLANS, PlannedTask
+from acwm_core.plugins import catalog
 from acwm_core.training.trained import copy_of, find_run, trained_models
 from acwm_experiment.files import TaskChoice, slug
-
-if TYPE_CHECKING:
-    from acwm_experiment.plan import PlannedRun
+from acwm_experiment.runs import PlannedRun
+from acwm_experiment.table import Experiment
+from acwm_planning.planned import PLANS, PlannedTask
+from acwm_planning.settings import settings_of
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Datasets in other formats: importers, exporters, and `arrays` for recordings in Python."""
+"""Datasets: inspecting, checking and encoding them, and other formats to import and export."""

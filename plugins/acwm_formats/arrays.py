@@ -17,8 +17,8 @@ from acwm_core.data.recordings import (
     import_dataset,
     recorded_card,
 )
-from acwm_core.environment import ActionSpec, StateField
-from acwm_core.episode import SPLITS, Split
+from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError, suggest
 from acwm_formats.video import shrunk, target_size
 

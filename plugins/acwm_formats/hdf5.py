@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 
 from acwm_core.data.formats import DatasetExporter, Export
-from acwm_core.episode import Episode
+from acwm_core.env.episode import Episode
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.formats import DatasetExporter, Export
-from acwm_core.environment import EnvironmentCard, StateField
-from acwm_core.episode import Episode
+from acwm_core.env.environment import EnvironmentCard, StateField
+from acwm_core.env.episode import Episode
 from acwm_formats.lerobot_layout import (
     ACTION,
     CARD,

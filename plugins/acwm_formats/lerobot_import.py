@@ -17,8 +17,8 @@ from PIL import Image
 
 from acwm_core.data.formats import DatasetImporter, import_command
 from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
-from acwm_core.environment import ActionSpec, StateField
-from acwm_core.episode import Split
+from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, suggest
 from acwm_formats.example import exported_example
 from acwm_formats.lerobot_export import LeRobotExporter

@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, cast
 
 from acwm_core.data.shards import UNREADABLE
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.untrusted import most_values, parse_json, printable, read_bytes
 

@@ -1,7 +1,6 @@
-"""Register the importers and exporters of datasets in other formats."""
+"""Register formats of datasets, and the commands `acwm data` and `acwm encode`."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
@@ -44,3 +43,27 @@ def register_dataset_exporters(registry: Registry) -> None:
         extra="hdf5",
         requires=("h5py",),
     )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add the commands, after `generate`."""
+    registry.add(
+        "data",
+        "acwm_formats.commands:data",
+        summary="inspect, check, import and export datasets",
+        after="generate",
+    )
+    registry.add(
+        "encode",
+        "acwm_formats.encoding:encode",
+        summary="encode the clips of a dataset as latents",
+        after="data",
+    )
+
+
+@hookimpl
+def register_checks(registry: Registry) -> None:
+    """Add the conformance suite of the kinds that this package defines."""
+    registry.add("dataset_importer", "acwm_formats.checks:check_dataset_importer")
+    registry.add("dataset_exporter", "acwm_formats.checks:check_dataset_exporter")

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.formats import DatasetExporter, DatasetImporter, Export, import_command
 from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
 from acwm_core.data.video import write_mp4
-from acwm_core.environment import ActionSpec, EnvironmentCard
-from acwm_core.episode import Split
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmError, DataError
+from acwm_core.plugins import catalog
 from acwm_formats.example import exported_example
 from acwm_formats.published_layout import (
     CITATION,

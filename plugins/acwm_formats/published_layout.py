@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.episode import Split
+from acwm_core.env.episode import Split
 from acwm_core.errors import DataError
 from acwm_core.training.plain_tensors import load_plain
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from acwm_core.data.formats import DatasetImporter, import_command
 from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
-from acwm_core.environment import ActionSpec, StateField
-from acwm_core.episode import EpisodeSpec, Split
+from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.video import shrunk, target_size
 

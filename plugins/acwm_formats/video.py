@@ -18,7 +18,7 @@ from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from acwm_core.data.video import MP4
-from acwm_core.environment import resolve_size
+from acwm_core.env.environment import resolve_size
 from acwm_core.errors import DataError
 
 MAX_PIXELS = 2**25  # most pixels of a frame: a little more than 8K video

@@ -1,7 +1,6 @@
 """Register the environments of this package. Does not import a simulator."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 _NEEDS = {"extra": "kinematics", "requires": ("mujoco", "pybullet", "taichi")}
 

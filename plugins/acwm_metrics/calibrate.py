@@ -17,14 +17,14 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import Episode, Split
-from acwm_core.estimator import Gap, StateEstimator
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import Episode, Split
+from acwm_core.env.physics import Gap, StateEstimator
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.metric import Rollout
+from acwm_core.evaluation.metric import Rollout
+from acwm_core.plugins import catalog
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts
 from acwm_metrics.physical import measured, physics_of

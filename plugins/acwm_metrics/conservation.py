@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.estimator import Constant, Physics
-from acwm_core.metric import Rollout
+from acwm_core.env.physics import Constant, Physics
+from acwm_core.evaluation.metric import Rollout
 from acwm_metrics.physical import (
     PhysicalMetric,
     measured,

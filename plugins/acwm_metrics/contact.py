@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.estimator import Gap, Physics
-from acwm_core.metric import Rollout
+from acwm_core.env.physics import Gap, Physics
+from acwm_core.evaluation.metric import Rollout
 from acwm_metrics.physical import PhysicalMetric, instance_id, measured, physics_of
 
 WINDOW = 5

@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
-from acwm_core.estimator import StateEstimator
-from acwm_core.metric import Rollout, SetMetric
-from acwm_core.shapes import Clip
+from acwm_core.evaluation.metric import Rollout, SetMetric
+from acwm_core.model.shapes import Clip
 from acwm_metrics.networks import fingerprint
 
 SIDE = 224

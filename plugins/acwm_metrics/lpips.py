@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
-from acwm_core.estimator import StateEstimator
-from acwm_core.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Rollout
 from acwm_metrics.networks import fingerprint, read_tensors
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)

@@ -9,10 +9,10 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import Constant, Gap, Level, Observation, Physics, StateEstimator, States
 from acwm_core.errors import PluginError
-from acwm_core.estimator import Constant, Gap, Level, Observation, Physics, StateEstimator, States
-from acwm_core.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Rollout
 
 
 class PhysicalMetric(Metric):

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.errors import ShapeError
-from acwm_core.metric import Metric, Numbers, Rollout
-from acwm_core.shapes import Clip
+from acwm_core.evaluation.metric import Metric, Numbers, Rollout
+from acwm_core.model.shapes import Clip
 
 MOTION_FLOOR = 0.01
 """Weight in M-MSE of a pixel that never changes."""

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.estimator import Physics, Reading, Symmetry
-from acwm_core.metric import Rollout
+from acwm_core.env.physics import Physics, Reading, Symmetry
+from acwm_core.evaluation.metric import Rollout
 from acwm_metrics.physical import (
     PhysicalMetric,
     physics_of,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from acwm_core.metric import Rollout
+from acwm_core.evaluation.metric import Rollout
 from acwm_metrics.physical import instance_id, physics_of
 from acwm_metrics.shape import counts
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Rollout
 from acwm_metrics.pixel import videos
 
 Sums = NDArray[np.float64]

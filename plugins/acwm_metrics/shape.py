@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from acwm_core.estimator import Physics
-from acwm_core.metric import Rollout
+from acwm_core.env.physics import Physics
+from acwm_core.evaluation.metric import Rollout
 from acwm_metrics.physical import (
     PhysicalMetric,
     instance_id,

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
-from acwm_core.catalog import catalog
 from acwm_core.data.recordings import recorded_card
-from acwm_core.environment import ActionSpec, EnvironmentCard
-from acwm_core.episode import Episode
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.episode import Episode
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError
-from acwm_core.estimator import StateEstimator
-from acwm_core.metric import Metric, Rollout, SetMetric
+from acwm_core.evaluation.metric import Metric, Rollout, SetMetric
+from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import own_name
 
 if TYPE_CHECKING:
-    from acwm_core.shapes import Clip, Video
+    from acwm_core.model.shapes import Clip, Video
 
 FRAMES_IN_UNIT_RANGE = {"data_range": 1.0, "normalize": True}
 """Parameters that tell metrics of torchmetrics that values lie in [0, 1]."""

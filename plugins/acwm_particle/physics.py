@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from acwm_core.estimator import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_core.env.physics import Constant, Gap, Level, Observation, Physics, Reading, States
 from acwm_particle.cup import THICKNESS, Vessel
 from acwm_sim.camera import Camera
 from acwm_sim.geometry import Array, axes_of_quaternion, points_to_post

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_particle.cup import Cup, Vessel
 from acwm_particle.physics import CONTAINER, CUP
 from acwm_particle.water import FRAME, Water

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_particle.physics import BOARD, HEIGHT_EXTENT
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID, SandDrawing

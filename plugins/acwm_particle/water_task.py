@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import Environment, Policy
-from acwm_core.estimator import Observation
-from acwm_core.planning.task import Goal, Task
+from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.physics import Observation
+from acwm_core.env.task import Goal, Task
 
 if TYPE_CHECKING:
     from acwm_particle.pour_water import PourWater

@@ -1,7 +1,6 @@
 """Register the protocol and the tables of ACWM-Phys."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 TABLES = {
     "main": "ACWM-DiT-S on all environments",

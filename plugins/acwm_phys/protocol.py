@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acwm_core.evaluation.benchmark import Protocol
+from acwm_core.evaluation.protocol import Protocol
 
 if TYPE_CHECKING:
     from acwm_core.evaluation.config import EvaluationConfig
@@ -20,7 +20,7 @@ DRAW_SEED = 0
 class PublishedWindows(Protocol):
     """Windows of 37 frames, ten from each of at most 50 episodes.
 
-    The published sampler has 50 points and so 49 evaluations, see `acwm_core.flow.Flow`. A whole
+    The published sampler has 50 points and so 49 evaluations, see `Flow`. A whole
     window is predicted at once, from one context frame.
     """
 

@@ -11,7 +11,7 @@ import click
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, seeds_of
 
 if TYPE_CHECKING:
-    from acwm_core.data.resumable import Line
+    from acwm_planning.resumable import Line
     from acwm_planning.table import RowSummary
 
 
@@ -52,7 +52,7 @@ def plan(
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
     """
-    from acwm_core.evaluation.planning.settings import ROWS, settings_of
+    from acwm_planning.settings import ROWS, settings_of
 
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, Environment, Policy
+from acwm_core.env.environment import ActionSpec, Environment, Policy
+from acwm_core.env.task import Goal, Task
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import WrongResultError, numbers
-from acwm_core.planning.planner import Cost, Plan, Planner, RolloutCost
-from acwm_core.planning.task import Goal, Task
 from acwm_planning.futures import History
+from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_planning.search import SearchPlanner
 
 Actions = Sequence[NDArray[np.float32]]

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import WrongResultError, named_by_user
-from acwm_core.planning.planner import Cost, Futures
-from acwm_core.planning.task import Goal, Task, judged
+from acwm_planning.planner import Cost, Futures
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import EpisodeSpec
-from acwm_core.evaluation.planning.settings import settings_of
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.planning.planner import Cost, Driver, RolloutCost
-from acwm_core.planning.task import Frame, Goal, Task
-from acwm_core.shapes import Actions
-from acwm_core.world_model import WorldModel
+from acwm_core.model.shapes import Actions
+from acwm_core.model.world_model import WorldModel
 from acwm_planning.controllers import Planned, Rollouts
 from acwm_planning.futures import History, ModelRollouts
+from acwm_planning.planner import Cost, Driver, RolloutCost
 from acwm_planning.run import make_cost, make_planner
+from acwm_planning.settings import settings_of
 
 
 class PlanningDriver(Driver):

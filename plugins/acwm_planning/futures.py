@@ -10,18 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.codec import Codec
 from acwm_core.data.encoding import cpu_has_fast_bfloat16
-from acwm_core.environment import EnvironmentCard
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.physics import Observation, StateEstimator
+from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.errors.plugin_code import shaped
-from acwm_core.estimator import Observation, StateEstimator
-from acwm_core.planning.planner import Cost, Futures, RolloutCost
-from acwm_core.planning.task import Frame, Goal, Task
-from acwm_core.shapes import Actions, Clip, Latent, Video
-from acwm_core.streaming import continued
-from acwm_core.world_model import WorldModel
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Actions, Clip, Latent, Video
+from acwm_core.model.stream import continued
+from acwm_core.model.world_model import WorldModel
+from acwm_planning.planner import Cost, Futures, RolloutCost
 
 
 @dataclass

@@ -1,7 +1,6 @@
-"""Registers planners, costs, a driver that plans and `acwm plan`."""
+"""Registers planners, costs, a driver that plans, `acwm plan` and `acwm rank`."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
@@ -65,10 +64,22 @@ def register_drivers(registry: Registry) -> None:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command."""
+    """Add the commands."""
     registry.add(
         "plan",
         "acwm_planning.commands:plan",
         summary="act by planning with a model, in the simulator",
         after="evaluate",
     )
+    registry.add(
+        "rank",
+        "acwm_planning.policies.commands:rank",
+        summary="rank policies in a model, and compare with the simulator",
+        after="plan",
+    )
+
+
+@hookimpl
+def register_checks(registry: Registry) -> None:
+    """Add the conformance suite of the kind that this package defines."""
+    registry.add("planner", "acwm_planning.checks:check_planner")

@@ -7,18 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.manifest import file_sha256
-from acwm_core.data.resumable import Line, ResumableResults
 from acwm_core.data.simulate import make_environment
-from acwm_core.environment import Environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.environment import Environment
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.planning.settings import Settings
 from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.planning.planner import Cost, Planner
-from acwm_core.planning.task import Task, TaskEnvironment
+from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
 from acwm_core.training.trained import find_run
 from acwm_planning.controllers import (
@@ -32,6 +29,9 @@ from acwm_planning.controllers import (
 from acwm_planning.episode import Played, TaskVariant, play
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
+from acwm_planning.planner import Cost, Planner
+from acwm_planning.resumable import Line, ResumableResults
+from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
 from acwm_planning.table import VIDEOS, RowSummary, left, summarise, write_summary
 from acwm_planning.video import episode_curves, imagined, write_episode

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.planning.planner import Plan, Planner, RolloutCost
-from acwm_core.shapes import Actions
+from acwm_core.model.shapes import Actions
+from acwm_planning.planner import Plan, Planner, RolloutCost
 
 LEAST = 0.02
 """Smallest standard deviation of `SearchPlanner.usual`, for actions scaled to [-1, 1]."""

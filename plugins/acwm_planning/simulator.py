@@ -9,15 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.codec import Codec
-from acwm_core.environment import Environment
+from acwm_core.env.environment import Environment
+from acwm_core.env.physics import Observation, StateEstimator
+from acwm_core.env.task import Frame, Goal, Task, observed
 from acwm_core.errors import RecipeError
 from acwm_core.errors.plugin_code import shaped
-from acwm_core.estimator import Observation, StateEstimator
-from acwm_core.planning.planner import Cost, Futures, RolloutCost
-from acwm_core.planning.task import Frame, Goal, Task, observed
-from acwm_core.shapes import Actions, Latent, Video
+from acwm_core.model.codec import Codec
+from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_planning.futures import History, still_latent, tensor_of
+from acwm_planning.planner import Cost, Futures, RolloutCost
 
 
 class SimulatorFutures(Futures):

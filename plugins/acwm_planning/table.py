@@ -12,10 +12,10 @@ import numpy as np
 from scipy.stats import binomtest
 
 from acwm_core.data.atomic import writing, written_whole
-from acwm_core.data.resumable import Line
-from acwm_core.evaluation.planning.settings import ROWS
-from acwm_core.statistics import CONFIDENCE, Estimate
-from acwm_core.statistics.bootstrap import with_interval
+from acwm_core.evaluation.statistics import CONFIDENCE, Estimate
+from acwm_core.evaluation.statistics.bootstrap import with_interval
+from acwm_planning.resumable import Line
+from acwm_planning.settings import ROWS
 
 SUMMARY, VIDEOS = "summary.json", "videos"
 """File and folder of a table, in addition to the files of `ResumableResults`."""

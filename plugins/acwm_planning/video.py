@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from acwm_core.data.atomic import writing, written_whole
 from acwm_core.data.video import write_mp4
-from acwm_core.estimator import StateEstimator
+from acwm_core.env.physics import StateEstimator
+from acwm_core.env.task import Task, judged
 from acwm_core.evaluation import videos
-from acwm_core.planning.task import Task, judged
-from acwm_core.shapes import Clip
+from acwm_core.model.shapes import Clip
 from acwm_planning.episode import Played
 from acwm_planning.futures import History, ModelRollouts
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_play.layout import Pointing
 
 

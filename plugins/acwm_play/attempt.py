@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError
 from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
-from acwm_core.planning.planner import Driver
-from acwm_core.planning.task import Goal
+from acwm_planning.planner import Driver
 from acwm_play.simulator import Moment
 from acwm_play.stage import Stage
 

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.denoiser import Denoiser
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.streaming import Stream
-from acwm_core.world_model import WorldModel
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.stream import Stream
+from acwm_core.model.world_model import WorldModel
 
 Frames = NDArray[np.uint8]
 

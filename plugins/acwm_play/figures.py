@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import AcwmError
-from acwm_core.estimator import StateEstimator
-from acwm_core.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.plugins import catalog
 from acwm_play.simulator import Moment
 
 METRICS = ("position_error", "height_error", "mask_iou")

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import Physics
 from acwm_core.errors import AcwmError
-from acwm_core.estimator import Physics
+from acwm_core.plugins import catalog
 from acwm_play.simulator import Scene, Simulator
 
 KEYS = (

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.episode import FactorValue
+from acwm_core.env.episode import FactorValue
 from acwm_core.errors import DataError
 from acwm_core.untrusted import parse_json, typed
 

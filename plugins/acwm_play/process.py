@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, PluginError, RecipeError
-from acwm_core.planning.task import Goal
 from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import Moment, Scene, Simulator, Standing
 

@@ -11,17 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held, writing
-from acwm_core.data.card import CARD, DatasetCard, package_versions, write_readme
+from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
+from acwm_core.data.readme import write_readme
 from acwm_core.data.shards import write_shard
 from acwm_core.data.video import write_mp4
-from acwm_core.environment import EnvironmentCard
-from acwm_core.environment_card import check_episode
-from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.env.card import check_episode
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import OtherDatasetError
 from acwm_core.evaluation.videos import join, magnification, panels
+from acwm_core.plugins import catalog
 from acwm_play.simulator import Moment
 
 MAX_FRAMES = 1201

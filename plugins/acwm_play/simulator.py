@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.data.simulate import make_environment
-from acwm_core.environment import Environment, Policy
-from acwm_core.episode import EpisodeSpec, FactorValue
+from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.episode import EpisodeSpec, FactorValue
+from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors.plugin_code import blaming
-from acwm_core.planning.task import Goal, Task, TaskEnvironment
+from acwm_core.plugins import catalog
 
 SCENES = 100_000
 """Number of scenes to draw from."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
-from acwm_core.planning.task import Task
+from acwm_core.env.task import Task
+from acwm_core.plugins import catalog
 from acwm_play.about import about_world, places
 from acwm_play.dream import Dream
 from acwm_play.figures import Instruments

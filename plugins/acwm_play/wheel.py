@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError
+from acwm_core.plugins import catalog
 from acwm_play import messages
 from acwm_play.attempt import Attempt
 from acwm_play.simulator import Moment

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, ParamSpec, TypeVar, get_args
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import EnvironmentCard
-from acwm_core.planning.planner import Driver
-from acwm_core.planning.task import Task
-from acwm_core.world_model import WorldModel
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.task import Task
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
+from acwm_planning.planner import Driver
 from acwm_play.dream import Dream
 from acwm_play.worlds import World, load, usual_actions
 

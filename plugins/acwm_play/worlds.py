@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
+from acwm_core.env.task import Task
 from acwm_core.errors import AcwmError, RecipeError, TrainingError
-from acwm_core.planning.task import Task
+from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, RunFolder, load_run
 from acwm_core.training.trained import find_run, trained_models
 

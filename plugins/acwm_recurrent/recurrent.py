@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import DynamicsModel, LatentStream
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.shapes import Latent
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import DynamicsModel, LatentStream
+from acwm_core.model.shapes import Latent
 from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
 
 START_CELLS, STEP_CELLS = 4, 2

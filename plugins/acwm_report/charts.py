@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.evaluation.results import Counterfactual, Summary
-from acwm_core.evaluation.score_grid import Scale, described, split_title
-from acwm_core.evaluation.severity_results import SeverityCurve, read_severity
-from acwm_core.metric import MetricInfo
 from acwm_report.figures import Chart, Curve, Numbers
 from acwm_report.run import ROWS, EvaluatedRun
+from acwm_report.score_grid import Scale, described, split_title
+from acwm_severity.curves import SeverityCurve, read_severity
 
 SECONDS = "seconds after the first frame"
 

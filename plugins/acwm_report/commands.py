@@ -32,7 +32,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     experiment's folder stands for its evaluated runs. --export writes the tables as CSV, Markdown
     and LaTeX, and the figures as PNG and PDF.
     """
-    from acwm_core.evaluation.experiment import Experiment, is_experiment
+    from acwm_experiment.table import Experiment, is_experiment
     from acwm_report.run import evaluated_runs
 
     found: list[Path] = []

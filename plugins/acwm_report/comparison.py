@@ -15,7 +15,7 @@ from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.clip_results import ClipResult, read_results
 from acwm_core.evaluation.results import Summary
-from acwm_core.statistics import holm, paired_bootstrap
+from acwm_core.evaluation.statistics import holm, paired_bootstrap
 from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], ClipResult]

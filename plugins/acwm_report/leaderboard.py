@@ -8,9 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.planning.tasks import PLANS
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.evaluation.score_grid import (
+from acwm_core.untrusted import read_bytes
+from acwm_planning.planned import PLANS
+from acwm_report.comparison import checksums
+from acwm_report.page import write_page
+from acwm_report.run import DAMAGE, clips_title
+from acwm_report.score_grid import (
     Cell,
     Column,
     ScoreGrid,
@@ -19,10 +23,6 @@ from acwm_core.evaluation.score_grid import (
     model_scores,
     split_title,
 )
-from acwm_core.untrusted import read_bytes
-from acwm_report.comparison import checksums
-from acwm_report.page import write_page
-from acwm_report.run import DAMAGE, clips_title
 from acwm_report.score_tables import failures
 from acwm_report.table import Row, Table
 from acwm_report.uses import Use, use_table, uses_of

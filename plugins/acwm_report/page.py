@@ -15,14 +15,14 @@ from typing import Any
 import acwm_core
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
-from acwm_core.evaluation.experiment import Experiment
-from acwm_core.evaluation.score_grid import split_title
+from acwm_experiment.table import Experiment
 from acwm_report import charts, plans, rankings, run, tables
 from acwm_report.comparison import run_labels
 from acwm_report.figures import Chart
 from acwm_report.plan_videos import VideoRoom, plan_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
+from acwm_report.score_grid import split_title
 from acwm_report.score_tables import experiment_tables, main_table
 from acwm_report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
 from acwm_report.task_tables import task_tables, task_videos

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from acwm_core.evaluation.planning.tasks import PLANS, SUMMARY
 from acwm_core.evaluation.results import Estimate
-from acwm_core.evaluation.score_grid import MISSING, Cell, Column, Scale
 from acwm_core.untrusted import read_json
+from acwm_planning.planned import PLANS, SUMMARY
 from acwm_report.run import EvaluatedRun, result_files
+from acwm_report.score_grid import MISSING, Cell, Column, Scale
 from acwm_report.table import Row, Table
 
 PERCENT = Scale(100.0, 0, "%")

@@ -1,12 +1,17 @@
 """Register the commands that report and compare evaluated runs."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
     """Add `acwm report`, `acwm compare` and `acwm leaderboard`."""
+    registry.add(
+        "evaluate",
+        "acwm_report.evaluate:evaluate",
+        summary="measure how good a trained model is",
+        after="fit",
+    )
     registry.add(
         "report",
         "acwm_report.commands:report",

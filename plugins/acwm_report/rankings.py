@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from acwm_core.evaluation.ranking import FILE, FOLDER, Ranking
-from acwm_core.evaluation.score_grid import Cell, Column, Scale
 from acwm_core.untrusted import read_json
+from acwm_planning.policies.ranking import FILE, FOLDER, Ranking
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun, result_files
+from acwm_report.score_grid import Cell, Column, Scale
 from acwm_report.table import Row, Table
 
 JUDGES = {

@@ -11,8 +11,8 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe.compose import RENAMED, read_recipe
+from acwm_severity.curves import read_severity
 
 
 def commands(folder: Path, summary: Summary) -> list[str]:

@@ -12,9 +12,9 @@ from jinja2 import TemplateError
 
 from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_results
-from acwm_core.evaluation.experiment import SUMMARY, Experiment
 from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
-from acwm_core.evaluation.score_grid import Scale, described
+from acwm_experiment.table import SUMMARY, Experiment
+from acwm_report.score_grid import Scale, described
 
 Made = TypeVar("Made")
 

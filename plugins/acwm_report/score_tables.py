@@ -10,9 +10,11 @@ from pathlib import Path
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import published_tables
 from acwm_core.evaluation.clip_results import read_results, tabulate
-from acwm_core.evaluation.experiment import SUMMARY, Experiment
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.score_grid import (
+from acwm_core.evaluation.statistics import ClipScores
+from acwm_experiment.table import SUMMARY, Experiment
+from acwm_report.run import EvaluatedRun, clips_title
+from acwm_report.score_grid import (
     CAPTION,
     Cell,
     ScoreGrid,
@@ -22,8 +24,6 @@ from acwm_core.evaluation.score_grid import (
     published_scores,
     split_title,
 )
-from acwm_core.statistics import ClipScores
-from acwm_report.run import EvaluatedRun, clips_title
 from acwm_report.seeds import difference_over_seeds, over_seeds
 from acwm_report.table import Row, Table
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acwm_core.statistics.bootstrap import (
+from acwm_core.evaluation.statistics.bootstrap import (
     FLAT,
     MIN_EPISODES,
     RESAMPLES,
@@ -22,7 +22,7 @@ from acwm_core.statistics.bootstrap import (
     standard_error,
     studentised,
 )
-from acwm_core.statistics.scores import ClipScores
+from acwm_core.evaluation.statistics.scores import ClipScores
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from acwm_core.evaluation.score_grid import INFINITE, MINUS, MISSING, Cell, Column
+from acwm_report.score_grid import INFINITE, MINUS, MISSING, Cell, Column
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult
+from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, defined
-from acwm_core.evaluation.score_grid import MISSING, Cell, Column, Scale, described, split_title
-from acwm_core.metric import MetricInfo
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
 from acwm_report.run import (
@@ -20,6 +19,7 @@ from acwm_report.run import (
     clips_title,
     label_title,
 )
+from acwm_report.score_grid import MISSING, Cell, Column, Scale, described, split_title
 from acwm_report.table import Row, Table
 from acwm_report.videos import EmbeddedVideo
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from acwm_core.evaluation.experiment import Experiment
-from acwm_core.evaluation.planning.tasks import SUMMARY, PlannedTask
-from acwm_core.evaluation.score_grid import Cell, Column, Scale
 from acwm_core.untrusted import read_json
+from acwm_experiment.table import Experiment
+from acwm_planning.planned import SUMMARY, PlannedTask
 from acwm_report.plan_videos import PlanVideo, VideoRoom
 from acwm_report.plans import CAPTION, COLUMNS, LAST, PlanTable, distance_scale, planned_row
 from acwm_report.run import EvaluatedRun
+from acwm_report.score_grid import Cell, Column, Scale
 from acwm_report.table import Row, Table
 
 HEADS = (*COLUMNS, Column("Final distance", better="↓"), Column("At the start"), *LAST)

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from acwm_core.estimator import Gap, Observation, Physics, Reading, States
+from acwm_core.env.physics import Gap, Observation, Physics, Reading, States
 from acwm_sim.camera import Camera
 from acwm_sim.geometry import (
     Array,

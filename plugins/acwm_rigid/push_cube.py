@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_core.errors import RecipeError
 from acwm_rigid.physics import PUSHER_RADIUS
 from acwm_rigid.push_drawing import MAX_CUBES, PushDrawing, TwoPusherDrawing

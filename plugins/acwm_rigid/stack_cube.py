@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor
 from acwm_rigid.stack_drawing import StackDrawing
 from acwm_rigid.stack_policy import Stacker
 from acwm_rigid.stack_simulation import GREEN, RED, StackSimulation, Start

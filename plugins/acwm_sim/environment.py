@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import Environment, Policy
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.episode import Factor, FactorValue
 from acwm_core.errors import RecipeError
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.scene import Scene

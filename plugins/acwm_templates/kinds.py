@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from acwm_core.registry import ComponentKind
+from acwm_core.plugins import ComponentKind
 
 
 @dataclass(frozen=True)

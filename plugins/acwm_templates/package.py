@@ -10,9 +10,9 @@ from typing import Any
 
 import jinja2
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import made_whole
 from acwm_core.errors import RecipeError
+from acwm_core.plugins import catalog
 from acwm_templates.kinds import KINDS
 
 FILES = Path(__file__).parent / "files"

@@ -45,7 +45,7 @@ def push(run: Path, address: str, overrides: tuple[str, ...], data: Path | None)
     Creates the repository, packages the run as `acwm ship` does and uploads the result. OVERRIDES
     change the evaluation. Run `hf auth login` before.
     """
-    from acwm_core.catalog import catalog
+    from acwm_core.plugins import catalog
 
     repository = address.removeprefix("hf://")
     if repository == address or repository.count("/") != 1 or "@" in repository:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.catalog import catalog
 from acwm_core.cli.arguments import OUT_FOLDER
 from acwm_core.cli.fit import wait_without_spinning
-from acwm_core.cli.tables import print_summary
+from acwm_core.plugins import catalog
+from acwm_report.terminal import print_summary
 
 if TYPE_CHECKING:
-    from acwm_core.episode import Split
+    from acwm_core.env.episode import Split
     from acwm_core.recipe import Recipe
 
 EPISODES: Mapping[Split, int] = {"train": 3200, "ind_test": 64, "ood_test": 64}

@@ -1,7 +1,6 @@
 """Registers the models in `models/`, the Hub, and the commands that make and publish models."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 from acwm_zoo.shipped import about, shipped
 
 
@@ -21,7 +20,29 @@ def register_trained_models(registry: Registry) -> None:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add `acwm demo`, `acwm ship` and `acwm push`."""
+    """Add `acwm demo`, `acwm ship`, `acwm push` and `acwm import-checkpoint`."""
     registry.add("demo", "acwm_zoo.demo:demo", summary="simulate, train, evaluate and report")
     registry.add("ship", "acwm_zoo.commands:ship", summary="package a run as a small trained model")
     registry.add("push", "acwm_zoo.commands:push", summary="publish a run on the Hugging Face Hub")
+    registry.add(
+        "import-checkpoint",
+        "acwm_zoo.import_checkpoint:import_checkpoint",
+        summary="make a run folder of a published checkpoint",
+        after="fit",
+    )
+
+
+@hookimpl
+def register_checks(registry: Registry) -> None:
+    """Add the conformance suite of the kind that this package defines."""
+    registry.add("importer", "acwm_zoo.checks:check_importer")
+
+
+@hookimpl
+def register_importers(registry: Registry) -> None:
+    """Register the importer of published weights."""
+    registry.add(
+        "published_dit",
+        "acwm_zoo.published_dit:PublishedCheckpoint",
+        summary="training checkpoints of the published ACWM-DiT (latest.pt)",
+    )

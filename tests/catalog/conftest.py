@@ -18,7 +18,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     def write(module: str, text: str, entry_point: str | None = None) -> None:
         written.append(module)
-        hook = "from acwm_core.hooks import hookimpl\n"
+        hook = "from acwm_core.plugins import hookimpl\n"
         (tmp_path / f"{module}.py").write_text(hook + textwrap.dedent(text))
         info = tmp_path / f"{module}-1.0.dist-info"
         info.mkdir()

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from acwm_core.catalog import Catalog
-from acwm_core.registry import COMPONENT_KINDS
+from acwm_core.plugins import COMPONENT_KINDS, Catalog
 
 Install = Callable[..., None]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.registry import Component
+from acwm_core.plugins import Component
 from tests.catalog.installing import Install, loaded, reasons, unharmed
 
 

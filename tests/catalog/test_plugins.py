@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, suggest
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 from tests.catalog.installing import REFERENCE, Install, loaded, reasons, unharmed
 
 

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 
 from acwm_core.checks.disc import GAIN, SHADE, Disc
-from acwm_core.environment import StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import StateField
+from acwm_core.env.episode import Factor
 from tests.checks.results import Flaws
 
 FLAWS = Flaws()

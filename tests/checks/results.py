@@ -2,9 +2,8 @@
 
 from collections.abc import Iterable
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import CheckResult
-from acwm_core.registry import Component
+from acwm_core.plugins import Component, catalog
 
 
 def in_words(check) -> str:

@@ -9,10 +9,10 @@ from torch import nn
 from acwm_core.checks import check_conditioner
 from acwm_core.checks.conditioner import ConditionerChecks
 from acwm_core.checks.result import checks_of
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Denoiser
 from acwm_core.errors import RecipeError
-from acwm_core.flow import Flow
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.flow import Flow
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
 from tests.checks.toys import AtTheInput, OneWidth

@@ -9,8 +9,8 @@ from acwm_core.checks import check_estimator
 from acwm_core.checks.disc import RADIUS, Disc
 from acwm_core.checks.estimator import EstimatorChecks
 from acwm_core.checks.result import checks_of
+from acwm_core.env.physics import Observation, Physics, Reading, StateEstimator
 from acwm_core.errors import ShapeError
-from acwm_core.estimator import Observation, Physics, Reading, StateEstimator
 from tests.checks.results import Flaws, failures, installed
 
 FLAWS = Flaws(check_estimator, checks_of(EstimatorChecks), Disc)

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from acwm_core.checks import check_importer
-from acwm_core.checks.importer import ImporterChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.errors import CheckpointError
-from acwm_dit.checkpoint import PublishedCheckpoint
+from acwm_zoo.checks import ImporterChecks
+from acwm_zoo.published_dit import PublishedCheckpoint
 from tests.checks.results import Flaws, failures, installed
 
 FLAWS = Flaws(check_importer, checks_of(ImporterChecks))

@@ -6,7 +6,7 @@ import pytest
 from acwm_core.checks import check_metric
 from acwm_core.checks.metric import ClipMetricChecks, SetMetricChecks
 from acwm_core.checks.result import checks_of
-from acwm_core.metric import Metric, SetMetric
+from acwm_core.evaluation.metric import Metric, SetMetric
 from tests.checks.results import Flaws, failures, installed
 
 FLAWS, SET_FLAWS = (

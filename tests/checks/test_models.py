@@ -12,8 +12,8 @@ from acwm_core.checks import check_model
 from acwm_core.checks.dynamics import DynamicsChecks, Probe
 from acwm_core.checks.model import DenoiserChecks
 from acwm_core.checks.result import checks_of
-from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import DynamicsModel
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import DynamicsModel
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed

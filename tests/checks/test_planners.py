@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from acwm_core.checks import check_planner
-from acwm_core.checks.planner import PlannerChecks
 from acwm_core.checks.result import checks_of
-from acwm_core.planning.planner import Plan, Planner
+from acwm_planning.checks import PlannerChecks
+from acwm_planning.planner import Plan, Planner
 from tests.checks.results import Flaws, failures, installed
 
 FLAWS = Flaws(check_planner, checks_of(PlannerChecks))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from tests.checks.results import installed
 
 FRAMES = 32

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from acwm_core.assembly import build_conditioner, build_world_model
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_conditioner, check_model
 from acwm_core.errors import RecipeError
-from acwm_core.flow import Flow
+from acwm_core.model.build import build_conditioner, build_world_model
+from acwm_core.model.flow import Flow
+from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, compose
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT

@@ -4,8 +4,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Denoiser
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.denoiser import Denoiser
 from tests.core.tiny import SumConditioner
 from tests.plugins import plugin_of
 

@@ -14,12 +14,11 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.cli.main import AcwmGroup
 from acwm_core.errors import exit_by_signal, plugin_code
+from acwm_core.plugins import COMPONENT_KINDS, catalog
 from acwm_core.recipe import compose
-from acwm_core.registry import COMPONENT_KINDS
 
 
 def run(*arguments: str | Path) -> Result:
@@ -101,7 +100,7 @@ def test_list_says_what_is_missing_and_broken(
 
 
 NEEDY = """
-    from acwm_core.hooks import hookimpl
+    from acwm_core.plugins import hookimpl
 
     @hookimpl
     def register_environments(registry):

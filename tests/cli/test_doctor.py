@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
-from acwm_core.cli import main
-from acwm_core.registry import Component
-from acwm_doctor import commands as doctor
+from acwm_core.cli import doctor, main
+from acwm_core.plugins import Component, catalog
 
 
 def test_the_report_covers_this_installation(
@@ -77,7 +75,7 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
     library = "libX11.so.6: cannot open shared object file: No such file or directory"
     (tmp_path / "broken_engine.py").write_text(f"raise ImportError({library!r})\n")
     (tmp_path / "plugin_broken_engine.py").write_text(
-        "from acwm_core.hooks import hookimpl\n\n"
+        "from acwm_core.plugins import hookimpl\n\n"
         "@hookimpl\n"
         "def register_environments(registry):\n"
         "    registry.add('broken', 'broken_engine:Environment')\n"

@@ -9,10 +9,10 @@ import click
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError
+from acwm_core.plugins import catalog
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
@@ -23,7 +23,7 @@ WORKING = {
     "report": "acwm_report.page.write_report",
     "compare": "acwm_report.comparison.compare_runs",
     "leaderboard": "acwm_report.leaderboard.write_leaderboard",
-    "rollout": "acwm_rollout.rollout.rollout_run",
+    "rollout": "acwm_dream.rollout.rollout_run",
     "fit": "acwm_core.training.launch.fit",
     "generate": "acwm_core.data.generate.generate",
     "experiment": "acwm_experiment.runner.run_experiment",

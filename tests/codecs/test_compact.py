@@ -7,10 +7,10 @@ import torch
 from safetensors.torch import save_file
 
 from acwm_codecs.compact import PACKAGED_WEIGHTS, Compact, fold, unfold
-from acwm_core.catalog import catalog
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
+from acwm_core.plugins import catalog
 from acwm_core.untrusted.weights import training_record
 
 

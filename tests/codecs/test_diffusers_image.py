@@ -5,10 +5,10 @@ import json
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_codec
 from acwm_core.checks.trial import moving_discs
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from tests.checks.results import failures
 

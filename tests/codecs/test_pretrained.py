@@ -10,13 +10,13 @@ import torch
 from click.testing import CliRunner
 from safetensors.torch import load_file, save_file
 
-from acwm_core.assembly import build_world_model
-from acwm_core.catalog import catalog
 from acwm_core.checks.codec import CodecChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.checks.trial import moving_discs
 from acwm_core.cli import main
 from acwm_core.errors import DataError, MissingExtraError, ShapeError
+from acwm_core.model.build import build_world_model
+from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from tests.codecs.tiny_autoencoders import original_state, save_tiny_codecs, tiny_flux, tiny_wan
 

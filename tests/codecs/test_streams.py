@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
-from acwm_core.flow import Flow
-from acwm_core.world_model import WorldModel
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
 
 FIT = {"width": 16, "layers": 1, "heads": 2}

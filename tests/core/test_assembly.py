@@ -2,11 +2,10 @@
 
 import pytest
 
-from acwm_core.assembly import build_world_model
-from acwm_core.catalog import catalog
-from acwm_core.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import RecipeError
-from acwm_core.hooks import hookimpl
+from acwm_core.model.build import build_world_model
+from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import compose
 from tests.core.tiny import PointwiseModel
 

@@ -4,14 +4,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from acwm_core.environment import (
+from acwm_core.env.environment import (
     ActionSpec,
     Environment,
     EnvironmentCard,
     StateField,
     resolve_size,
 )
-from acwm_core.episode import Episode, EpisodeSpec, Factor, draw_factors, ood_label
+from acwm_core.env.episode import Episode, EpisodeSpec, Factor, draw_factors, ood_label
 from acwm_core.errors import ActionError, RecipeError, ShapeError
 
 GAIN = Factor.continuous(

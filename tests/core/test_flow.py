@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from acwm_core.errors import RecipeError
-from acwm_core.flow import TRAINING_POINTS, Flow, gaussian_weights, mix, shifted_schedule
+from acwm_core.model.flow import TRAINING_POINTS, Flow, gaussian_weights, mix, shifted_schedule
 
 PUBLISHED = json.loads((Path(__file__).parents[1] / "reference/flow_schedule.json").read_text())
 

@@ -7,7 +7,7 @@ linear function `exact_velocity`, and its flow takes the noise ε to m + s ε.
 import pytest
 import torch
 
-from acwm_core.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
+from acwm_core.model.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
 
 MEAN, SPREAD = 0.7, 0.4
 OBJECTIVES = ["full_sequence", "diffusion_forcing"]

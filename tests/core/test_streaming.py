@@ -4,12 +4,12 @@ import pytest
 import torch
 from torch import nn
 
-from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.dynamics import Cache
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.flow import Flow
-from acwm_core.world_model import WorldModel
+from acwm_core.model.codec import Codec
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.dynamics import Cache
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
 from tests.core.tiny import MeanCodec, PointwiseModel, SumConditioner
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.world_model import WorldModel
+from acwm_core.model.world_model import WorldModel
 from tests.core.tiny import MeanCodec, tiny_world_model
 
 

@@ -3,11 +3,11 @@
 import torch
 from torch import nn
 
-from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Denoiser
-from acwm_core.flow import Flow
-from acwm_core.world_model import WorldModel
+from acwm_core.model.codec import Codec
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
 
 
 class MeanCodec(Codec):

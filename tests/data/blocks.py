@@ -2,7 +2,7 @@
 
 import torch
 
-from acwm_core.codec import Codec
+from acwm_core.model.codec import Codec
 
 
 class Blocks(Codec):

@@ -12,8 +12,8 @@ for place in (HERE, HERE.parents[1]):  # scripts of these tests import this file
 
 from square_world import plugin  # noqa: E402
 
-from acwm_core.catalog import catalog  # noqa: E402
 from acwm_core.data.generate import generate  # noqa: E402
+from acwm_core.plugins import catalog  # noqa: E402
 from tests.folders import checksums as checksums  # noqa: E402
 from tests.folders import wait_until as wait_until  # noqa: E402
 

@@ -13,9 +13,9 @@ import av
 import numpy as np
 import yaml
 
-from acwm_core.data.check import check_dataset
 from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, action_statistics
 from acwm_core.errors import DataError
+from acwm_formats.check import check_dataset
 
 
 def problems(folder, **options):

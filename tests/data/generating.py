@@ -5,8 +5,8 @@ import sys
 
 from square_world import plugin
 
-from acwm_core.catalog import catalog
 from acwm_core.data.generate import generate
+from acwm_core.plugins import catalog
 
 EPISODES = {"train": 12, "ind_test": 3}
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
-from acwm_core.episode import Factor
-from acwm_core.hooks import hookimpl
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
+from acwm_core.env.episode import Factor
+from acwm_core.plugins import hookimpl
 
 SIDE = 4
 

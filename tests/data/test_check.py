@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from forging import forge, npy, problems
 
-from acwm_core.data.check import check_dataset
 from acwm_core.data.manifest import MANIFEST
+from acwm_formats.check import check_dataset
 
 
 @pytest.fixture

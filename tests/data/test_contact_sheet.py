@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_data.preview import (
+from acwm_formats.preview import (
     ACCENT,
     GAP,
     LINE_HEIGHT,

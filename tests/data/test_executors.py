@@ -6,10 +6,9 @@ from click.testing import CliRunner
 from conftest import EPISODES, checksums
 
 from acwm_core import executors
-from acwm_core.catalog import catalog
 from acwm_core.cli.main import main
 from acwm_core.executors import Executor
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import catalog, hookimpl
 
 
 class BackwardsExecutor(Executor):

@@ -14,7 +14,6 @@ from click.testing import CliRunner
 from conftest import EPISODES, checksums
 from square_world import Square
 
-from acwm_core.catalog import catalog
 from acwm_core.cli.main import main
 from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
@@ -25,6 +24,7 @@ from acwm_core.data.shards import open_shard
 from acwm_core.data.simulate import ShardTask, make_shard, simulated
 from acwm_core.errors import DataError, PluginError, RecipeError, UnknownNameError
 from acwm_core.executors import LocalExecutor, progress_bar
+from acwm_core.plugins import catalog
 
 
 def make(out, environment="square", **changes):

@@ -12,7 +12,7 @@ from acwm_core.data.encoding import encode_windows
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset
 from acwm_core.data.loader import Fetching, ResumableLoader
-from acwm_core.environment import ActionSpec
+from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DamagedShardError
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import Environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.environment import Environment
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from tests.core.test_environment import Point
 

@@ -9,7 +9,7 @@ from conftest import EPISODES
 from PIL import Image
 
 from acwm_core.errors import DataError
-from acwm_data.preview import describe, preview
+from acwm_formats.preview import describe, preview
 
 
 def test_the_facts_agree_with_the_files(square_data):

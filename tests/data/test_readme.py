@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import yaml
 
-from acwm_core.data.card import MARK, README, DatasetCard, write_readme
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
+from acwm_core.data.readme import MARK, README, write_readme
 
 
 def page(folder):

@@ -12,7 +12,7 @@ from test_simulate import assert_same
 
 from acwm_core.data.shards import MEMBERS, from_npy, from_npz, open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
 
 VERSIONS = {"acwm": "1"}

@@ -5,7 +5,7 @@ import pytest
 from square_world import SIDE
 
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import ActionError, PluginError, RecipeError, ShapeError, UnknownNameError
 
 

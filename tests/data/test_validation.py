@@ -10,11 +10,10 @@ import yaml
 from forging import problems
 from square_world import Square
 
-from acwm_core.catalog import catalog
 from acwm_core.data.generate import generate
 from acwm_core.data.manifest import MANIFEST
 from acwm_core.errors import DataError, PluginError
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import catalog, hookimpl
 
 
 def later(method, change):

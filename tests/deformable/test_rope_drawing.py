@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_deformable.push_rope import PushRope
 from acwm_deformable.rope import Cord
 from acwm_deformable.rope_curves import lay_rope

@@ -10,13 +10,13 @@ import torch
 import yaml
 from click.testing import CliRunner
 
-from acwm_checkpoints.importing import import_checkpoint
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.errors import TrainingError
+from acwm_core.plugins import catalog
 from acwm_core.training.launch import fit
 from acwm_core.training.run import load_run, read_metadata
+from acwm_zoo.importing import import_checkpoint
 from tests.codecs.tiny_autoencoders import original_state, tiny_wan
 from tests.dit.latest import REFERENCE, WORDS, content, reference, writer
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from acwm_checkpoints.importing import import_checkpoint
-from acwm_core.catalog import catalog
 from acwm_core.errors import CheckpointError, DataError, PluginError, RecipeError
+from acwm_core.plugins import catalog
+from acwm_zoo.importing import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
 from tests.plugins import Attack, plugin_of
 

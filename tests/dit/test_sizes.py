@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import acwm_dit.plugin
-from acwm_core.catalog import Catalog
+from acwm_core.plugins import Catalog
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch.nn import functional
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
-from acwm_core.flow import Flow
-from acwm_core.world_model import WorldModel
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from acwm_dit import blocks
 from acwm_dit.attention import temporal_rotation
 from acwm_dit.dit import DiT

@@ -1,6 +1,6 @@
 """A run of the recurrent model without training: it has a state that it carries on."""
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 from tests.evaluation import tiny as evaluation
 from tests.planning import tiny
 

@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 
 import acwm
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.env.task import Goal
 from acwm_core.errors import ActionError, AcwmError, RecipeError
-from acwm_core.planning.task import Goal
 from tests.planning import tiny
 from tests.policies import slide
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import acwm
-from acwm_core.catalog import catalog
 from acwm_core.errors import ActionError, AcwmError
+from acwm_core.plugins import catalog
 from tests.planning import tiny
 from tests.plugins import plugin_of
 from tests.policies import slide

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.disc import Disc
 from acwm_core.data.simulate import make_environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
 from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.plugins import catalog
 from acwm_core.untrusted.weights import training_record
 from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator

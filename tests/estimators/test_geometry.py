@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 from acwm_estimators.curve import same_end_first
 from acwm_estimators.layout import layout_of
 from acwm_estimators.plugin import TRAINED

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from acwm_core.environment import Environment
-from acwm_core.hooks import hookimpl
-from acwm_core.metric import Metric
+from acwm_core.env.environment import Environment
+from acwm_core.evaluation.metric import Metric
+from acwm_core.plugins import hookimpl
 from tests.evaluation.tiny import Drift, LinearModel
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_environment
 from acwm_core.cli import main
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import PluginError
 from acwm_core.errors.plugin_code import blaming
+from acwm_core.plugins import catalog
 from tests.evaluation import author, tiny
 
 HERE = Path(author.__file__)

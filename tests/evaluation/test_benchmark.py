@@ -7,20 +7,19 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core import evaluation
-from acwm_core.catalog import Catalog
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.evaluation.benchmark import (
     Protocol,
     PublishedRow,
     PublishedTable,
-    protocol_named,
     published_for,
 )
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.evaluation.results import Summary
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import Catalog, hookimpl
 from tests.evaluation import tiny
 
 

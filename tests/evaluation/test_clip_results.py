@@ -11,8 +11,8 @@ from acwm_core.evaluation.clip_results import (
     summarise,
     write_results,
 )
+from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.results import Estimate
-from acwm_core.metric import Metric
 from acwm_metrics.pixel import PSNR
 
 

@@ -6,13 +6,14 @@ import torch
 
 from acwm_core.checks.disc import Disc
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.environment import ActionSpec
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.environment import ActionSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import ClipPlan, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.counterfactual import counterfactual
 from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.metric import Rollout
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import build_metrics
 from acwm_core.evaluation.simulator import (
@@ -22,7 +23,6 @@ from acwm_core.evaluation.simulator import (
     plan_branches,
     simulate_fans,
 )
-from acwm_core.metric import Rollout
 from acwm_metrics.response import Response
 
 FRAMES, CLIPS = 10, 2

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.evaluation.results import Summary
+from acwm_formats.check import check_dataset
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "first_release"
 

@@ -7,7 +7,7 @@ import torch
 from acwm_core.checks.disc import Disc
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.clips import ClipPlan, derangement, noise_seed, plan_clips

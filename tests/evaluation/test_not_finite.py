@@ -16,8 +16,8 @@ from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import RunFolder, load_run
-from acwm_core.world_model import WorldModel
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import boards_of
 from acwm_report.page import write_report
@@ -72,7 +72,7 @@ def test_json_without_a_reader_of_ours_tells_it_too(failing):
 
 
 def test_every_table_shows_it(failing, tmp_path, capsys):
-    from acwm_core.cli.tables import print_summary
+    from acwm_report.terminal import print_summary
 
     print_summary(Summary.read(failing))
     shown = capsys.readouterr().out
@@ -121,7 +121,7 @@ def test_weights_that_are_not_finite_are_refused(evaluated, tmp_path):
 
 
 def test_a_rollout_that_is_not_finite_is_refused(evaluated, tmp_path, monkeypatch):
-    from acwm_rollout import rollout
+    from acwm_dream import rollout
 
     def diverging(model, given, actions, **settings):
         yield given.expand(-1, 4, -1, -1, -1)

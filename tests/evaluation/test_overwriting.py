@@ -14,9 +14,9 @@ from acwm_core.evaluation.clip_results import EPISODES, read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.replacing import replacing_result, result_file
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
-from acwm_core.evaluation.severity import sweep_severity
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
+from acwm_severity.sweep import sweep_severity
 from tests.evaluation import tiny
 
 FAST = {"counterfactual_episodes": 0, "perturbed_episodes": 0, "videos": 0}

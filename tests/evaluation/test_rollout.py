@@ -7,12 +7,12 @@ import torch
 from PIL import Image
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.environment import ActionSpec
+from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import ActionError, AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
+from acwm_dream.rollout import _read_actions, frame_strip, rollout_run
 from acwm_formats.arrays import write_dataset
-from acwm_rollout.rollout import _read_actions, frame_strip, rollout_run
 from tests.evaluation import tiny
 from tests.recordings import Noise
 

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.metric import SetMetric
 from acwm_core.evaluation.results import Estimate, Summary
-from acwm_core.evaluation.severity import sweep_severity
-from acwm_core.evaluation.severity_results import read_severity
-from acwm_core.hooks import hookimpl
-from acwm_core.metric import SetMetric
+from acwm_core.plugins import catalog, hookimpl
+from acwm_severity.curves import read_severity
+from acwm_severity.sweep import sweep_severity
 from tests.evaluation import tiny
 
 SSIM = "torchmetrics.image.StructuralSimilarityIndexMeasure"

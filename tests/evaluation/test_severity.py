@@ -12,11 +12,11 @@ from acwm_core.checks.disc import GAIN, SHADE
 from acwm_core.cli.main import main
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.episode import Factor
+from acwm_core.env.episode import Factor
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.severity import sweep_severity
-from acwm_core.evaluation.severity_results import POINTS, parse_sweep, read_severity
 from acwm_core.executors import LocalExecutor
+from acwm_severity.curves import POINTS, parse_sweep, read_severity
+from acwm_severity.sweep import sweep_severity
 from tests.evaluation import tiny
 
 COUNT = Factor.discrete("count", "how many", train=(1, 2, 3), ood=(4, 5), nominal=2)

@@ -6,7 +6,7 @@ import pytest
 from acwm_core.checks.disc import Disc
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import ClipPlan
 from acwm_core.evaluation.config import EvaluationConfig

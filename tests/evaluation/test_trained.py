@@ -8,7 +8,7 @@ from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.launch import fit
 from acwm_core.training.run import load_run
-from acwm_rollout.rollout import rollout_run
+from acwm_dream.rollout import rollout_run
 from tests.evaluation import tiny
 
 RECIPE = {

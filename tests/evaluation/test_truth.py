@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.estimator import Observation, Physics, StateEstimator
+from acwm_core.env.physics import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clip_results import summarise_split
 from acwm_core.evaluation.clips import ClipPlan, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.scoring import build_metrics, measured_in, split_available
-from acwm_core.metric import Metric
 from acwm_core.training.run import load_run
 
 OFF = 0.25

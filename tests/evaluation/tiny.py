@@ -3,15 +3,15 @@
 import torch
 from torch import nn
 
-from acwm_core.assembly import build_world_model
-from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
-from acwm_core.codec import Codec
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
-from acwm_core.denoiser import Denoiser
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
-from acwm_core.episode import Factor
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
+from acwm_core.env.episode import Factor
+from acwm_core.model.build import build_world_model
+from acwm_core.model.codec import Codec
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.training.run import save_weights

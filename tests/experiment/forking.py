@@ -44,7 +44,7 @@ def serve(path):
     """Fork for every connection; single-threaded, as forks of threads would be unsafe."""
     import acwm_core.evaluation.evaluate
     import acwm_core.training.launch  # noqa: F401
-    from acwm_core.catalog import catalog
+    from acwm_core.plugins import catalog
     from acwm_experiment import commands
     from tests.experiment.parts import Plugin
 
@@ -99,8 +99,7 @@ def accept(listener, children):
 def become(words, folder, environment):
     """Be the command."""
     from acwm_core.cli import main
-    from acwm_core.cli.__main__ import end_with_input
-    from acwm_core.evaluation.experiment import ENDS_WITH_INPUT
+    from acwm_core.cli.__main__ import ENDS_WITH_INPUT, end_with_input
 
     os.setsid()
     os.chdir(folder)

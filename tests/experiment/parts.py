@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from acwm_core.planning.task import Goal, Task
+from acwm_core.env.task import Goal, Task
 from tests.evaluation import tiny
 from tests.plugins import plugin_of
 

@@ -7,10 +7,10 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import AcwmError
-from acwm_core.evaluation.experiment import Experiment
 from acwm_experiment.files import DataChoice, read_experiment
 from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
+from acwm_experiment.table import Experiment
 
 GOOD = """
 title: Pushing

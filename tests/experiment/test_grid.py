@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.experiment import FILE
 from acwm_experiment.grid import read_grid
 from acwm_experiment.plan import make_plan
+from acwm_experiment.table import FILE
 from tests.experiment.parts import write_experiment
 
 GRID = ("model.width=4,6", "training.learning_rate=1e-2,2e-2")

@@ -7,13 +7,13 @@ import signal
 import pytest
 
 from acwm_core.errors import AcwmError
-from acwm_core.evaluation.experiment import Experiment
-from acwm_core.evaluation.planning.settings import settings_of
-from acwm_core.evaluation.planning.tasks import PlannedTask
-from acwm_core.recipe.validate import check_component
+from acwm_core.recipe.check import check_component
 from acwm_experiment.files import read_experiment
 from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
+from acwm_experiment.table import Experiment
+from acwm_planning.planned import PlannedTask
+from acwm_planning.settings import settings_of
 from tests.experiment.parts import write_experiment
 from tests.folders import wait_until
 

@@ -4,8 +4,8 @@ import hashlib
 import re
 import signal
 
-from acwm_core.evaluation.experiment import Experiment
 from acwm_experiment.steps import saved_steps
+from acwm_experiment.table import Experiment
 from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until
 

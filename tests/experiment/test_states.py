@@ -9,10 +9,10 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.experiment import Experiment
 from acwm_core.recipe import Recipe
 from acwm_experiment.files import DataChoice, read_experiment
-from acwm_experiment.plan import PlannedDataset, make_plan
+from acwm_experiment.plan import make_plan
+from acwm_experiment.runs import PlannedDataset
 from acwm_experiment.steps import (
     all_progress,
     all_steps,
@@ -22,6 +22,7 @@ from acwm_experiment.steps import (
     saved_steps,
     training_progress,
 )
+from acwm_experiment.table import Experiment
 from acwm_report.run import evaluated_runs
 from tests.evaluation import tiny
 

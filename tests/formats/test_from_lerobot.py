@@ -9,10 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
+from acwm_formats.check import check_dataset
 from acwm_formats.lerobot_import import LeRobot
 from tests.formats import release
 from tests.formats.conftest import episodes_of, psnr

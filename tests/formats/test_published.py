@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
+from acwm_core.plugins import catalog
+from acwm_formats.check import check_dataset
 from acwm_formats.published import Published
 from acwm_formats.published_layout import read_entries
 from tests.folders import wait_until

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.environment import ActionSpec
+from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError, ShapeError
 from acwm_formats.arrays import Recording, write_dataset
+from acwm_formats.check import check_dataset
 from tests.formats import release
 from tests.formats.conftest import checksums
 

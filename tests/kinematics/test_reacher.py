@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher import LIMITS, ReacherArm
 from acwm_kinematics.reacher_arm import Links

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_kinematics.arm_drawing import ARM_ID, FIRST_POST_ID, GRIPPER_ID, MAX_POSTS, MET, WAITING
 from acwm_kinematics.arm_layout import CENTRAL, HOME, OFFSETS
 from acwm_kinematics.arm_planner import Clearance

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from acwm_core.environment import ActionSpec, EnvironmentCard
-from acwm_core.estimator import Observation, Physics, StateEstimator
-from acwm_core.metric import Rollout
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.physics import Observation, Physics, StateEstimator
+from acwm_core.evaluation.metric import Rollout
 
 SIDE = 32
 

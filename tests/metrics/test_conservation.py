@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.estimator import Constant, Gap, Physics, Reading
+from acwm_core.env.physics import Constant, Gap, Physics, Reading
 from acwm_metrics.calibrate import calibrate, worst
 from acwm_metrics.conservation import (
     AmountError,

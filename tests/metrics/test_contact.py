@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.estimator import Gap, Physics
+from acwm_core.env.physics import Gap, Physics
 from acwm_metrics.calibrate import best_touch, f1_score
 from acwm_metrics.contact import (
     ContactPrecision,

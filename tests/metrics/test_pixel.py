@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from acwm_core.catalog import catalog
-from acwm_core.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import ShapeError
-from acwm_core.metric import Rollout
+from acwm_core.evaluation.metric import Rollout
+from acwm_core.plugins import catalog
 from acwm_metrics.pixel import MSE, PSNR, SSIM, MaskedMSE, MeanPSNR
 from acwm_metrics.plugin import LIBRARIES
 

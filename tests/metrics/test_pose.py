@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from acwm_core.estimator import Physics, Reading
+from acwm_core.env.physics import Physics, Reading
 from acwm_metrics.pose import (
     OrientationError,
     PixelPositionError,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.estimator import Level, Physics
+from acwm_core.env.physics import Level, Physics
 from acwm_metrics.shape import HeightError, MaskIoU, OutlineError
 from tests.metrics.seeing import SIDE, boxes, clip
 

@@ -8,11 +8,11 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.image import PeakSignalNoiseRatio
 
-from acwm_core.catalog import catalog
 from acwm_core.checks import check_metric
 from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.evaluation.metric import SetMetric
 from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.metric import SetMetric
+from acwm_core.plugins import catalog
 from acwm_metrics.torchmetrics import TorchMetric, as_torchmetric
 from tests.metrics.seeing import boxes, clip
 from tests.metrics.test_pixel import rollout

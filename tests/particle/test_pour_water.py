@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
-from acwm_core.estimator import Observation
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.physics import Observation
 from acwm_particle.cup import THICKNESS
 from acwm_particle.physics import CONTAINER, POUR_WATER
 from acwm_particle.pour_water import RECORDED, PourWater

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_particle.push_sand import RADIUS, RECORDED, PushSand, height_map
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID
 from acwm_particle.sand_layout import DOUBLED, GRAINS

@@ -10,20 +10,20 @@ import torch
 from click.testing import CliRunner
 from safetensors.torch import load_file
 
-from acwm_core.cli.evaluate import evaluate
 from acwm_core.cli.main import main
 from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.episode import Episode, EpisodeSpec
+from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.benchmark import Protocol
 from acwm_core.evaluation.clip_results import read_results, summarise
 from acwm_core.evaluation.clips import ClipPlan, Sample, cut_episode, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.protocol import Protocol
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.scoring import Prediction, build_metrics, score
 from acwm_core.training.run import load_run
 from acwm_phys.protocol import PublishedWindows
+from acwm_report.evaluate import evaluate
 from tests.evaluation import tiny
 
 REFERENCE = Path(__file__).parent.parent / "reference"

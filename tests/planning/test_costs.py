@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
+from acwm_core.env.physics import Observation
+from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, RecipeError
-from acwm_core.estimator import Observation
-from acwm_core.planning.planner import Cost, Futures
-from acwm_core.planning.task import Goal
+from acwm_core.plugins import catalog
 from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
+from acwm_planning.planner import Cost, Futures
 from tests.planning import tiny
 from tests.planning.problems import planned, quadratic
 

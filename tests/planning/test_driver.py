@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.planning.settings import settings_of
-from acwm_core.planning.planner import Driver
+from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_planning.controllers import Planned
 from acwm_planning.futures import History, ModelRollouts
+from acwm_planning.planner import Driver
 from acwm_planning.run import make_cost, make_planner
+from acwm_planning.settings import settings_of
 from tests.planning import tiny
 
 FEW = (

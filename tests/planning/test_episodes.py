@@ -44,10 +44,10 @@ def test_planning_in_the_simulator_gets_there_and_doing_nothing_does_not():
 def test_planning_in_the_simulator_solves_reacher_far_more_often_than_doing_nothing():
     pytest.importorskip("mujoco")
     pytest.importorskip("taichi")
-    from acwm_core.catalog import catalog
     from acwm_core.data.simulate import make_environment
-    from acwm_core.episode import EpisodeSpec
-    from acwm_core.planning.task import TaskEnvironment
+    from acwm_core.env.episode import EpisodeSpec
+    from acwm_core.env.task import TaskEnvironment
+    from acwm_core.plugins import catalog
 
     def unseen():  # rendering takes most of the time, and the task does not look
         environment = make_environment("reacher", {"size": 16})
@@ -139,7 +139,7 @@ def test_the_simulator_s_futures_are_what_happens():
 
 def test_seen_through_the_codec_states_are_those_of_the_reconstruction():
     """Blocks of 4 pixels, which the estimator reads to about as much."""
-    from acwm_core.catalog import catalog
+    from acwm_core.plugins import catalog
 
     history = History(tiny.spec(4), [], [])
     actions = 4 * torch.rand(3, 4, 2, generator=torch.Generator().manual_seed(0)) - 2

@@ -159,7 +159,7 @@ def test_a_prediction_that_is_not_finite_costs_nan_whatever_the_cost_says(bundle
 @pytest.mark.parametrize(("fast", "tolerance"), [(False, 1e-5), (True, 0.01)])
 def test_a_memoryless_codec_decodes_no_more_than_is_asked_for(monkeypatch, fast, tolerance):
     """The pictures are those of the whole video, in bfloat16 too."""
-    from acwm_core.catalog import catalog
+    from acwm_core.plugins import catalog
     from acwm_planning.futures import ModelFutures
 
     monkeypatch.setattr("acwm_planning.futures.cpu_has_fast_bfloat16", lambda: fast)

@@ -10,8 +10,8 @@ import av
 import pytest
 
 from acwm_core.cli import main
-from acwm_core.evaluation.planning.settings import ROWS, settings_of
 from acwm_planning.page import write_page
+from acwm_planning.settings import ROWS, settings_of
 from tests.planning import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]

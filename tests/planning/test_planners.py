@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.evaluation.planning.settings import settings_of
-from acwm_core.planning.planner import Planner
+from acwm_planning.planner import Planner
 from acwm_planning.sampling import coloured_noise, path_weights
+from acwm_planning.settings import settings_of
 from tests.planning.problems import (
     HIGH,
     LOW,
@@ -235,7 +235,7 @@ def test_impossible_parameters_are_refused(name, params, message):
 
 
 def test_all_are_registered():
-    from acwm_core.catalog import catalog
+    from acwm_core.plugins import catalog
 
     assert {each.name for each in catalog().registry("planner")} >= PLANNERS.keys()
     for name, kind in PLANNERS.items():

@@ -7,8 +7,8 @@ import math
 import pytest
 from scipy.stats import beta
 
-from acwm_core.data.resumable import EPISODES, ResumableResults
 from acwm_core.errors import DataError
+from acwm_planning.resumable import EPISODES, ResumableResults
 from acwm_planning.table import left, mcnemar, summarise
 
 

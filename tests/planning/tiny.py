@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 from torch import nn
 
-from acwm_core.catalog import catalog
 from acwm_core.data.generate import generate
-from acwm_core.episode import EpisodeSpec
-from acwm_core.estimator import Observation, Physics, StateEstimator
-from acwm_core.hooks import hookimpl
-from acwm_core.planning.task import Goal, Task, TaskEnvironment
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.physics import Observation, Physics, StateEstimator
+from acwm_core.env.task import Goal, Task, TaskEnvironment
+from acwm_core.plugins import catalog, hookimpl
 from tests.evaluation import tiny
 
 HERE = __name__

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 from acwm_play.wheel import PERSON, POLICY, Wheel
 from acwm_play.worlds import tasks_of
 from tests.play import drivers

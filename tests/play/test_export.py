@@ -12,11 +12,11 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.errors import AcwmError, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.world_model import WorldModel
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from acwm_play.export import episodes, graphs, page, runtime
 from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, exported
 from acwm_play.layout import Pointing, physics_of

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from acwm_core.data.check import check_dataset
+from acwm_formats.check import check_dataset
 from tests.browsing import DESK, PHONE
 from tests.play.pages import seen, shown, until
 

@@ -187,7 +187,7 @@ def test_bad_words_end_with_one_sentence(run, tmp_path):
 
 
 def card_of(name):
-    return pytest.importorskip("acwm_core.catalog").catalog().component("environment", name)
+    return pytest.importorskip("acwm_core.plugins").catalog().component("environment", name)
 
 
 def test_arrows_move_things_the_way_that_they_point():

@@ -10,8 +10,8 @@ import pytest
 from aiohttp import WSMsgType, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
-from acwm_core.data.check import check_dataset
 from acwm_core.data.episodes import EpisodeDataset
+from acwm_formats.check import check_dataset
 from acwm_play import serve
 from acwm_play.house import House
 from acwm_play.worlds import playable

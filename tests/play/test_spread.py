@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.checks.trial import shaken
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.flow import Flow
-from acwm_core.world_model import WorldModel
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from acwm_play import dream
 from acwm_play.dream import Dream
 from tests.play import follower

@@ -5,12 +5,11 @@ from dataclasses import replace
 import torch
 from torch import nn
 
-from acwm_core.assembly import build_world_model
-from acwm_core.catalog import catalog
-from acwm_core.conditioner import Conditioner, Conditioning
 from acwm_core.data.card import DatasetCard
-from acwm_core.dynamics import DynamicsModel, LatentStream
-from acwm_core.hooks import hookimpl
+from acwm_core.model.build import build_world_model
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.dynamics import DynamicsModel, LatentStream
+from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import save_weights
 from tests.evaluation.tiny import METRICS, SIDE

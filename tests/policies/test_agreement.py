@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from acwm_policies.agreement import agreement, decisions, mmrv, regret
+from acwm_planning.policies.agreement import agreement, decisions, mmrv, regret
 
 RNG = np.random.default_rng(0)
 

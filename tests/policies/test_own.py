@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError
-from acwm_core.planning.task import Goal
 from acwm_core.training.run import load_run
-from acwm_policies.own import OwnPolicy
-from acwm_policies.stages import ModelStage, SimulatorStage
+from acwm_planning.policies.own import OwnPolicy
+from acwm_planning.policies.stages import ModelStage, SimulatorStage
 from tests.planning import tiny
 from tests.policies import slide
 

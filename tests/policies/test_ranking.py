@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from acwm_core.data.manifest import file_sha256
-from acwm_core.data.resumable import ResumableResults
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.ranking import FILE, Ranking
 from acwm_core.training.run import load_run
 from acwm_core.untrusted import read_json
-from acwm_policies.commands import print_ranking
-from acwm_policies.run import Ranker, rank_policies
-from acwm_policies.scripted import ScriptedPolicy, declared
-from acwm_policies.stages import ModelStage, SimulatorStage
-from acwm_policies.table import summarise
+from acwm_planning.policies.commands import print_ranking
+from acwm_planning.policies.ranking import FILE, Ranking
+from acwm_planning.policies.run import Ranker, rank_policies
+from acwm_planning.policies.scripted import ScriptedPolicy, declared
+from acwm_planning.policies.stages import ModelStage, SimulatorStage
+from acwm_planning.policies.table import summarise
+from acwm_planning.resumable import ResumableResults
 from tests.planning import tiny
 from tests.policies import slide
 

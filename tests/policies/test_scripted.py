@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.data.simulate import make_environment
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import TaskEnvironment
 from acwm_core.errors import RecipeError
-from acwm_core.planning.task import TaskEnvironment
-from acwm_policies.scripted import HOLD, ScriptedPolicy, declared, scripted, solvable
+from acwm_core.plugins import catalog
+from acwm_planning.policies.scripted import HOLD, ScriptedPolicy, declared, scripted, solvable
 from tests.planning import tiny
 
 STEPS = 12

@@ -3,9 +3,9 @@
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.catalog import Catalog, Problem
 from acwm_core.cli import main
 from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.plugins import Catalog, Problem
 from acwm_core.recipe import compose, recipe_names
 from tests.plugins import plugin_of
 

@@ -4,11 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import Registry, catalog, hookimpl
 from acwm_core.recipe import ComponentConfig, Recipe, compose
-from acwm_core.registry import Registry
 
 
 class Codec:

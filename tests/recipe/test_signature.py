@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import pytest
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import COMPONENT_KINDS, catalog
+from acwm_core.recipe.check import SECTIONS
 from acwm_core.recipe.signature import signature
-from acwm_core.recipe.validate import SECTIONS
-from acwm_core.registry import COMPONENT_KINDS
 
 PARTS = {
     component.target

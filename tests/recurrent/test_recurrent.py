@@ -7,13 +7,13 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from acwm_core.catalog import catalog
-from acwm_core.conditioner import Conditioning
-from acwm_core.dynamics import DynamicsModel
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.world_model import DECODED_TOGETHER, WorldModel
+from acwm_core.plugins import catalog
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.optimizers import build_optimizer
-from acwm_core.world_model import DECODED_TOGETHER, WorldModel
 from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.recurrent import RecurrentModel
 

@@ -9,8 +9,8 @@ from acwm_core.evaluation.clip_results import (
     summarise_split,
     write_results,
 )
+from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.results import FOLDER, Summary
-from acwm_core.metric import Metric
 
 SEED, FRAMES, FPS = 0, 5, 10
 

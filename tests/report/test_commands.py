@@ -4,9 +4,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.catalog import Catalog, catalog
 from acwm_core.cli import main
-from acwm_core.hooks import hookimpl
+from acwm_core.plugins import Catalog, catalog, hookimpl
 from acwm_experiment.files import read_experiment
 from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
@@ -61,7 +60,7 @@ def test_without_it_nothing_is_to_be_reported(without_the_plugin, monkeypatch, t
     assert {step.kind for step in all_steps(plan)} == {"simulate", "train", "evaluate"}
     (tmp_path / "recipe.yaml").touch()
     monkeypatch.setattr("acwm_core.evaluation.evaluate.evaluate_run", lambda *_, **__: None)
-    monkeypatch.setattr("acwm_core.cli.evaluate.print_summary", lambda _: None)
+    monkeypatch.setattr("acwm_report.evaluate.print_summary", lambda _: None)
     ended = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
     assert (ended.exit_code, ended.output) == (0, "")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell
+from acwm_experiment.table import Experiment, ExperimentCell
 from acwm_report.page import export_report, write_report
 from acwm_report.score_tables import experiment_tables
 from acwm_report.table import to_csv, to_latex

@@ -18,11 +18,11 @@ from acwm_core.evaluation.results import (
     SplitSummary,
     Summary,
 )
-from acwm_core.evaluation.score_grid import Scale
-from acwm_core.statistics import paired_bootstrap
+from acwm_core.evaluation.statistics import paired_bootstrap
 from acwm_report.charts import smooth
 from acwm_report.page import write_report
 from acwm_report.run import EvaluatedRun, verdict_title
+from acwm_report.score_grid import Scale
 from acwm_report.videos import action_traces
 from tests.evaluation import tiny
 from tests.report import synthetic

@@ -11,8 +11,8 @@ import pytest
 from acwm_core.cli import main
 from acwm_core.data.video import write_mp4
 from acwm_core.errors import AcwmWarning
-from acwm_core.evaluation.ranking import FILE
 from acwm_core.evaluation.results import Summary, write_json
+from acwm_planning.policies.ranking import FILE
 from acwm_planning.table import summarise
 from acwm_planning.video import EpisodeCurves
 from acwm_planning.video import PlannedDistances as Expected

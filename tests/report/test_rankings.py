@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from acwm_core.evaluation.ranking import FILE, Agreement, Decisions, PolicyScores, Ranking
 from acwm_core.evaluation.results import Summary, write_json
-from acwm_core.statistics import Estimate
+from acwm_core.evaluation.statistics import Estimate
+from acwm_planning.policies.ranking import FILE, Agreement, Decisions, PolicyScores, Ranking
 from acwm_report.page import export_report, write_report
 
 

@@ -9,11 +9,11 @@ from acwm_core.cli import main
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.severity import sweep_severity
-from acwm_core.evaluation.severity_results import read_severity
 from acwm_core.recipe import compose
 from acwm_report.page import write_report
 from acwm_report.reproduce import commands
+from acwm_severity.curves import read_severity
+from acwm_severity.sweep import sweep_severity
 from tests.evaluation import tiny
 
 SWEEP = "factors.colour=200,90"

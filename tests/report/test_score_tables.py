@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from acwm_core.catalog import Catalog
-from acwm_core.evaluation import score_grid
 from acwm_core.evaluation.benchmark import published_for
-from acwm_core.evaluation.score_grid import described
-from acwm_core.metric import MetricInfo
+from acwm_core.evaluation.metric import MetricInfo
+from acwm_core.plugins import Catalog
+from acwm_report import score_grid
 from acwm_report.run import EvaluatedRun
+from acwm_report.score_grid import described
 from acwm_report.score_tables import main_table
 from acwm_report.tables import score_tables, state_tables
 from tests.report import synthetic

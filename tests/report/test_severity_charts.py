@@ -8,8 +8,8 @@ import shlex
 import pytest
 
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.severity import sweep_severity
 from acwm_report.page import export_report, write_report
+from acwm_severity.sweep import sweep_severity
 from tests.evaluation import tiny
 
 CURVE = "run1-severity-colour"

@@ -7,8 +7,8 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
-from acwm_core.evaluation.experiment import Experiment, ExperimentCell
-from acwm_core.evaluation.planning.tasks import PlannedTask
+from acwm_experiment.table import Experiment, ExperimentCell
+from acwm_planning.planned import PlannedTask
 from acwm_report.page import export_report, write_report
 from acwm_report.run import evaluated_runs
 from tests.report.test_plans import add_plans, make_run

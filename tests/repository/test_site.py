@@ -14,8 +14,8 @@ from urllib.parse import unquote
 import click
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
+from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from acwm_core.recipe.recipe import flat_items
 from tests.browsing import DESK, PHONE

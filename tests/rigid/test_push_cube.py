@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_rigid.push_cube import REACH, PushCube, PushCubeCrowded, PushCubeTwoPushers
 from acwm_rigid.push_drawing import PALETTES
 from tests.sim.playing import play, states, undrawn

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 from acwm_rigid.stack_cube import DIRECTIONS, SPREAD, StackCube
 from acwm_rigid.stack_simulation import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
 from tests.sim.playing import start, undrawn

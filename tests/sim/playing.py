@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
 
 
 def undrawn(world):

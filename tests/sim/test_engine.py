@@ -70,7 +70,7 @@ def triple(x: float) -> float:
     code = """
 import torch
 from kernel import triple
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 environment = catalog().component("environment", "push_cube").create(size=(64, 64))
 print(triple(2.0))
 """

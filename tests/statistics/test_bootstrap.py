@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from acwm_core.statistics import RESAMPLES, holm, paired_bootstrap
+from acwm_core.evaluation.statistics import RESAMPLES, holm, paired_bootstrap
 
 
 def test_intervals_are_those_of_the_t_test_for_normal_differences():

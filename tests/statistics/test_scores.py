@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from acwm_core.statistics import ClipScores, Estimate, compare, finite, gap_between
+from acwm_core.evaluation.statistics import ClipScores, Estimate, compare, finite, gap_between
 from tests.statistics.worlds import decibels, pooled, scores
 
 TRIALS = 300

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from acwm_core.statistics import ClipScores
+from acwm_core.evaluation.statistics import ClipScores
 
 
 def scores(values, episodes=None, starts=0, summarise=None):

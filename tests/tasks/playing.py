@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from acwm_core.catalog import catalog
-from acwm_core.episode import EpisodeSpec
-from acwm_core.estimator import Observation
-from acwm_core.planning.task import TaskEnvironment
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.physics import Observation
+from acwm_core.env.task import TaskEnvironment
+from acwm_core.plugins import catalog
 
 SEED = 5
 

@@ -9,15 +9,13 @@ from click.testing import CliRunner
 from gymnasium.utils.env_checker import check_env
 
 import acwm  # noqa: F401 - registers environments
-from acwm_core.catalog import catalog
 from acwm_core.checks.task import TaskChecks
 from acwm_core.cli.main import main
 from acwm_core.data.simulate import simulate
-from acwm_core.episode import EpisodeSpec
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import Goal, Task, TaskEnvironment, observed
 from acwm_core.errors import PluginError, RecipeError, UnknownNameError
-from acwm_core.hooks import hookimpl
-from acwm_core.planning.task import Goal, Task, TaskEnvironment, observed
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, catalog, hookimpl
 from tests.tasks.playing import begin, make, solve, spec_of
 
 pytest.importorskip("mujoco")

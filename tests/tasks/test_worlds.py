@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
 from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.plugins import catalog
 from tests.tasks.playing import begin, like, make, seen, solve, spec_of
 
 pytest.importorskip("mujoco")
@@ -198,7 +198,7 @@ def test_a_rope_has_no_first_end():
 
 
 def test_sand_counts_by_its_volume_inside_of_the_region():
-    from acwm_core.planning.task import Goal
+    from acwm_core.env.task import Goal
     from acwm_particle.sand_task import GATHER
 
     heights = np.zeros((3, 24, 40))
@@ -215,7 +215,7 @@ def test_sand_counts_by_its_volume_inside_of_the_region():
 
 
 def test_water_counts_once_it_has_come_down_and_spilling_is_for_good():
-    from acwm_core.planning.task import Goal
+    from acwm_core.env.task import Goal
     from acwm_particle.water_task import FILL
 
     goal = Goal({"water_share": np.array([0.5, 0.5, 0.0])}, *[np.zeros((8, 8), np.uint8)] * 2)

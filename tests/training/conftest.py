@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from acwm_core.catalog import catalog
 from acwm_core.data.generate import generate
+from acwm_core.plugins import catalog
 from tests.training.tiny import TinyPlugin
 
 

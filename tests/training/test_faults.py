@@ -14,11 +14,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from acwm_core.catalog import catalog
 from acwm_core.data.atomic import held
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.data.loader import ResumableLoader
 from acwm_core.errors import AcwmError, DataError, TrainingError
+from acwm_core.plugins import catalog
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata

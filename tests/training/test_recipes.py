@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from acwm_core.catalog import catalog
+from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from acwm_core.recipe.compose import recipe_names
 from acwm_core.training.launch import fit

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from acwm_core.data.clips import DataConfig
-from acwm_core.environment import ActionSpec
+from acwm_core.env.environment import ActionSpec
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.launch import fit
 from acwm_core.training.run import RunFolder, load_run

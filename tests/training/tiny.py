@@ -11,14 +11,14 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import nn
 
-from acwm_core.codec import Codec
-from acwm_core.conditioner import Conditioner, Conditioning
-from acwm_core.denoiser import Denoiser
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, StateField
-from acwm_core.flow import Flow
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
+from acwm_core.model.codec import Codec
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.flow import Flow
+from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
 from acwm_core.training.optimizers import local
-from acwm_core.world_model import WorldModel
 from tests.plugins import plugin_of
 
 

@@ -9,8 +9,8 @@ import json
 import os
 import sys
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError
+from acwm_core.plugins import catalog
 from acwm_core.training.launch import fit
 from tests.training.tiny import TinyPlugin, tiny_recipe
 

@@ -6,8 +6,8 @@ SECTIONS is JSON. Errors for users end it with their sentence and exit code.
 import json
 import sys
 
-from acwm_core.catalog import catalog
 from acwm_core.errors import AcwmError
+from acwm_core.plugins import catalog
 from acwm_core.training.launch import fit
 from tests.training.tiny import TinyPlugin, tiny_recipe
 

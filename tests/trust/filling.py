@@ -14,8 +14,8 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
+from acwm_core.plugins import catalog
 
 ROOM = "size=64m"
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from acwm_core.estimator import Observation
-from acwm_core.hooks import hookimpl
-from acwm_core.metric import Metric, SetMetric
-from acwm_core.planning.planner import Plan, Planner
+from acwm_core.env.physics import Observation
+from acwm_core.evaluation.metric import Metric, SetMetric
+from acwm_core.plugins import hookimpl
+from acwm_planning.planner import Plan, Planner
 from tests.core.tiny import SumConditioner
 from tests.evaluation.tiny import BlockCodec, Drift, LinearModel
 from tests.planning.tiny import Slide, SquareEstimator, ToPlace

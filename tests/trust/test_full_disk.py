@@ -12,10 +12,10 @@ import safetensors
 import torch
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.data.atomic import disk_error, made_whole, written_whole
 from acwm_core.data.generate import generate
+from acwm_core.plugins import catalog
 from tests.planning import tiny as planning
 from tests.report.synthetic import clips, run
 from tests.training.tiny import TinyPlugin, tiny_recipe

@@ -16,19 +16,19 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.manifest import Manifest
 from acwm_core.data.shards import open_shard
 from acwm_core.data.video import Limits, decode_planes
-from acwm_core.environment_card import ActionSpec
+from acwm_core.env.card import ActionSpec
 from acwm_core.evaluation.clip_results import read_rows
-from acwm_core.evaluation.experiment import Experiment
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.severity_results import SeverityCurve
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import read_metadata, save_weights
 from acwm_core.untrusted import read_json
+from acwm_dream.rollout import _read_actions
 from acwm_experiment.steps import saved_steps
+from acwm_experiment.table import Experiment
 from acwm_formats.lerobot_import import LeRobot
-from acwm_rollout.rollout import _read_actions
+from acwm_severity.curves import SeverityCurve
 from tests.trust.mutating import changed, damaged, dumped, survives
 
 HERE = Path(__file__).parents[1] / "reference/first_release"

@@ -16,10 +16,10 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.evaluation.results import Summary, VideoRecord
-from acwm_core.evaluation.score_grid import Cell, Column
 from acwm_report.figures import Chart, Curve
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
+from acwm_report.score_grid import Cell, Column
 from acwm_report.table import Row, Table, file_name, to_csv, to_markdown
 from tests.report.synthetic import clips, run
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.assembly import build_world_model
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import RecipeError
+from acwm_core.model.build import build_world_model
 from acwm_core.recipe import compose
 from acwm_core.recipe.text import parse
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.data import atomic
 from acwm_core.data.atomic import alone, held, made_whole
-from acwm_core.data.resumable import ResumableResults
 from acwm_core.errors import DataError, TrainingError
+from acwm_core.plugins import catalog
 from acwm_core.training import launch, trained
 from acwm_core.training.launch import fit
+from acwm_planning.resumable import ResumableResults
 from tests.experiment import parts as experiment
 from tests.folders import checksums
 from tests.planning import tiny as planning

@@ -12,10 +12,10 @@ from safetensors.torch import load_file
 
 from acwm_codecs.compact import Compact
 from acwm_codecs.train_compact import save
-from acwm_core.catalog import catalog
 from acwm_core.cli import main
 from acwm_core.errors import TrainingError
 from acwm_core.evaluation.results import Summary
+from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.training.effort import all_training
 from acwm_core.training.launch import fit

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import acwm
-from acwm_core.assembly import build_world_model
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
+from acwm_core.model.build import build_world_model
 from acwm_core.recipe.recipe import compose
 from acwm_core.training.run import RunFolder, load_weights, read_metadata
 from acwm_zoo.packing import FILES, MAX_BYTES

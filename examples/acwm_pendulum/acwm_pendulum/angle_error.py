@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Rollout
 
 
 class AngleError(Metric):

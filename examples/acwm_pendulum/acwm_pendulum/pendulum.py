@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
-from acwm_core.episode import Factor, FactorValue
+from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
+from acwm_core.env.episode import Factor, FactorValue
 from acwm_pendulum.drawing import draw
 
 GRAVITY = 9.81  # m/s²

@@ -1,7 +1,6 @@
 """What this package registers with acwm. A component is imported only when it is used."""
 
-from acwm_core.hooks import hookimpl
-from acwm_core.registry import Registry
+from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl

@@ -5,9 +5,9 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.environment import Environment, Policy
-from acwm_core.estimator import Observation
-from acwm_core.planning.task import Goal, Task
+from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.physics import Observation
+from acwm_core.env.task import Goal, Task
 from acwm_pendulum.pendulum import GRAVITY, MASS, MAX_TORQUE, Pendulum
 
 

@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from acwm_core.conditioner import Conditioning
 from acwm_core.errors import MissingExtraError, RecipeError
-from acwm_core.shapes import Actions, Latent, Video
-from acwm_core.world_model import WorldModel
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.shapes import Actions, Latent, Video
+from acwm_core.model.world_model import WorldModel
 
 NEEDS_TORCH = "2.13"
 """With 2.9 the exporter fails on recurrent models; the versions in between are untested."""

@@ -1,0 +1,124 @@
+"""Completions of arguments. They import nothing heavy, and return nothing after an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Literal, get_args, get_origin
+
+import click
+from click.shell_completion import CompletionItem
+
+from acwm_core.errors import AcwmError
+from acwm_core.plugins import COMPONENT_KINDS, ComponentKind, catalog
+from acwm_core.recipe.check import SECTIONS, validate
+from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
+from acwm_core.recipe.recipe import flat_items
+from acwm_core.recipe.signature import signature
+from acwm_core.recipe.types import show
+
+Items = list[CompletionItem]
+
+
+def components(ctx: click.Context, incomplete: str) -> Items:
+    """Names of all components except commands and checks."""
+    kinds: list[ComponentKind] = [
+        kind for kind in COMPONENT_KINDS if kind not in ("command", "check")
+    ]
+    found = {each.name: each.summary for kind in kinds for each in catalog().registry(kind)}
+    return _starting(incomplete, found.items())
+
+
+def environments(ctx: click.Context, incomplete: str) -> Items:
+    """Names of environments."""
+    return _starting(incomplete, _named("environment"))
+
+
+def recipes(ctx: click.Context, incomplete: str) -> Items:
+    """Recipes that come with acwm, and files, which the shell adds."""
+    paths = sorted(recipe_folder().glob("*.yaml"))
+    return [*_starting(incomplete, ((path.stem, "") for path in paths)), _files(incomplete)]
+
+
+def experiments(ctx: click.Context, incomplete: str) -> Items:
+    """Experiments by folder and name, recipes, and files, which the shell adds."""
+    folders = (recipe_folder() / name for name in ("ablations", "benchmark"))
+    paths = sorted(path for folder in folders for path in folder.glob("*.yaml"))
+    named = ((f"{path.parent.name}/{path.stem}", "") for path in paths)
+    return [*_starting(incomplete, named), *recipes(ctx, incomplete)]
+
+
+def overrides(ctx: click.Context, incomplete: str) -> Items:
+    """Keys with their current values in the recipe; after ``key=``, the possible values.
+
+    Bash treats ``=`` as a separate word, so key and value arrive as separate words.
+    """
+    words = [*(ctx.params.get("overrides") or ())]
+    key, joined, text = incomplete.partition("=")
+    if joined:
+        return _starting(incomplete, ((f"{key}={value}", "") for value in _values(ctx, key)))
+    if len(words) > 1 and words[-1] == "=":
+        return _starting(text or key, ((value, "") for value in _values(ctx, words[-2])))
+    if words and not incomplete and "=" not in words[-1] and words[-1][0] != "+":
+        return _starting("", ((value, "") for value in _values(ctx, words[-1])))
+    overlays = sorted((recipe_folder() / OVERLAYS).glob("*.yaml"))
+    named = [(f"+{path.stem}", "overlay") for path in overlays]
+    return _starting(incomplete, [*_keys(ctx), *named])
+
+
+def _keys(ctx: click.Context) -> Iterator[tuple[str, str]]:
+    for key, value in flat_items(_recipe(ctx)):
+        key = key.removesuffix(".name") if key.removesuffix(".name") in COMPONENTS else key
+        text = show(value)
+        yield f"{key}={text if text.replace('.', '').replace('-', '').isalnum() else ''}", ""
+
+
+def _values(ctx: click.Context, key: str) -> list[str]:
+    """The possible values of a parameter, if its type lists them."""
+    section, _, parameter = key.partition(".")
+    kind: Any = "environment" if section == "env" else section
+    if section in COMPONENTS and not parameter:
+        return [name for name, _ in _named(kind)]
+    target = SECTIONS.get(section)
+    if section in COMPONENTS and (name := _recipe(ctx).get(section, {}).get("name")):
+        target = catalog().component(kind, name).target
+    takes = signature(target) if target else None
+    found = takes.parameters.get(parameter) if takes else None
+    if found is None:
+        return []
+    choices = get_args(found.type) if get_origin(found.type) is Literal else ()
+    return ["true", "false"] if found.type is bool else [str(choice) for choice in choices]
+
+
+def _recipe(ctx: click.Context) -> dict[str, Any]:
+    """The recipe on the command line with all defaults; empty if there is none or it is invalid."""
+    name = ctx.params.get("recipe") or ctx.params.get("file")
+    try:
+        return validate(read_recipe(name)) if name else {}
+    except AcwmError:
+        return {}
+
+
+def _named(kind: ComponentKind) -> list[tuple[str, str]]:
+    return [(each.name, each.summary) for each in catalog().registry(kind)]
+
+
+def _starting(incomplete: str, found: Iterable[tuple[str, str]]) -> Items:
+    return [
+        CompletionItem(value, help=about or None)
+        for value, about in sorted(found)
+        if value.startswith(incomplete)
+    ]
+
+
+def _files(incomplete: str) -> CompletionItem:
+    return CompletionItem(incomplete, type="file")
+
+
+COMPLETIONS = {
+    "name": components,
+    "environment": environments,
+    "recipe": recipes,
+    "file": experiments,
+    "overrides": overrides,
+}
+"""Functions by the name of the argument that they complete."""

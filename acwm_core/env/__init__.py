@@ -1,0 +1,1 @@
+"""Environments: the interface, cards, episodes, what can be measured, and tasks. No torch."""

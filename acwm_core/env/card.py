@@ -1,0 +1,172 @@
+"""The card of an environment: its actions, states and factors, readable without a simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.env.episode import Episode, Factor
+from acwm_core.errors import ActionError, ShapeError, expect
+
+ActionKind = Literal["absolute", "delta", "torque"]
+"""What an action commands: a position, a change of position, or a force or torque."""
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """The meaning, units and bounds of the action dimensions.
+
+    Attributes:
+        names: one per dimension, e.g. ``("target_x", "target_y")``.
+        units: one per dimension, e.g. ``("m", "m")``; ``""`` for a pure number.
+        low: lower bounds in these units; models use the bounds to normalise actions to [-1, 1].
+        high: upper bounds.
+        kind: what an action commands: ``"absolute"``, ``"delta"`` or ``"torque"`` (also forces).
+
+    Raises:
+        ShapeError: the lengths differ, or a lower bound is not below its upper bound.
+        ActionError: the kind is unknown.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    kind: ActionKind
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.names), len(self.units), len(self.low), len(self.high)}
+        if len(lengths) != 1:
+            raise ShapeError("an ActionSpec needs a name, a unit, a low and a high per dimension")
+        bounds = zip(self.low, self.high, strict=True)
+        if not all(-math.inf < low < high < math.inf for low, high in bounds):
+            raise ShapeError("every lower action bound must lie below its upper bound, both finite")
+        if self.kind not in get_args(ActionKind):
+            known = ", ".join(get_args(ActionKind))
+            raise ActionError(f"the kind of an action is one of {known}, not {self.kind!r}")
+
+    @property
+    def size(self) -> int:
+        """Number of action dimensions A."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class StateField:
+    """One named array of ground truth, recorded in every frame.
+
+    Attributes:
+        name: key in `Episode.states`.
+        shape: shape of one frame's value.
+        unit: e.g. ``"m"``; ``""`` for none.
+        description: one phrase, including the frame of reference if there is one.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    description: str
+
+
+@dataclass(frozen=True)
+class EnvironmentCard:
+    """What users, datasets and models need to know about an environment without running it.
+
+    Attributes:
+        name: registered name.
+        summary: one sentence.
+        action: meaning and bounds of the action.
+        frame_size: default ``(H, W)``.
+        fps: frames, and so actions, per second.
+        horizon: number of frames of an episode, T.
+        factors: the factors of variation.
+        ood_shifts: names of the factors that `ood_test` shifts, one per episode in turn.
+        state: the ground-truth arrays.
+        instances: names of the mask ids, in order; id 0 is the background.
+        engine: the simulator, e.g. ``"MuJoCo"``.
+        episodes: number of episodes per split in the full benchmark.
+        variants: other registered names that are variants of this environment.
+        citation: source of the task.
+    """
+
+    name: str
+    summary: str
+    action: ActionSpec
+    frame_size: tuple[int, int]
+    fps: int
+    horizon: int
+    factors: tuple[Factor, ...]
+    ood_shifts: tuple[str, ...]
+    state: tuple[StateField, ...]
+    instances: tuple[str, ...]
+    engine: str
+    episodes: Mapping[str, int] = field(default_factory=dict[str, int])
+    variants: tuple[str, ...] = ()
+    citation: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON-ready dict, the inverse of `from_dict`."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
+        """The inverse of `to_dict`, also after a round trip through JSON or YAML."""
+        values = {name: _tuples(value) for name, value in fields.items()}
+        values["action"] = ActionSpec(**_fields(fields["action"]))
+        values["factors"] = tuple(Factor(**_fields(f)) for f in fields["factors"])
+        values["state"] = tuple(StateField(**_fields(f)) for f in fields["state"])
+        values["episodes"] = dict(fields.get("episodes", {}))
+        return cls(**values)
+
+
+def check_episode(episode: Episode, card: EnvironmentCard) -> None:
+    """Check the arrays of an episode against the environment card.
+
+    Raises:
+        DataError: a shape, type, id or range is wrong; the message says which.
+    """
+    frames, (height, width) = len(episode.video), card.frame_size
+    shape, names = episode.video.shape[1:], len(card.instances)
+    expect(shape == (height, width, 3), f"frames are {shape}, the card says {height}×{width}")
+    masks = episode.masks
+    expect(masks.shape == (frames, height, width), f"masks are {masks.shape}")
+    expect(masks.dtype == np.uint8, f"masks are {masks.dtype}, not uint8")
+    expect(masks.max(initial=0) < names, f"mask id {masks.max(initial=0)} has no name")
+    _check_actions(episode.actions, card.action)
+    fields = {field.name: field.shape for field in card.state}
+    expect(set(episode.states) == set(fields), f"the state fields are {sorted(episode.states)}")
+    for name, values in episode.states.items():
+        expect(values.shape[1:] == fields[name], f"state {name} is {values.shape[1:]}")
+        expect(values.dtype.kind in "fiub", f"state {name} is {values.dtype}")
+        expect(np.all(np.isfinite(values)), f"state {name} is not finite")
+    contacts = episode.contacts
+    expect(contacts.ndim == 2 and contacts.shape[1] == 3, f"contacts are {contacts.shape}")
+    low, high = contacts.min(initial=0), contacts[:, 1:].max(initial=0)
+    inside = low >= 0 and high < names and contacts[:, 0].max(initial=0) < frames
+    expect(inside, "a contact refers to a frame or an instance that does not exist")
+
+
+def _check_actions(actions: NDArray[np.float32], spec: ActionSpec) -> None:
+    expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
+    expect(actions.shape[1:] == (spec.size,), f"actions are {actions.shape}")
+    expect(np.all(np.isfinite(actions)), "an action is not finite")
+    least, most = np.array(spec.low), np.array(spec.high)
+    slack = 1e-6 * (most - least)  # float32 rounding of a bound is no violation
+    taken = actions[:-1].astype(np.float64)
+    bounded = np.all((taken >= least - slack) & (taken <= most + slack))
+    expect(bounded, "an action is out of bounds")
+
+
+def _fields(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _tuples(value) for name, value in values.items()}
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return tuple(_tuples(item) for item in cast(Iterable[Any], value))
+    return value

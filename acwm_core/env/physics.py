@@ -1,0 +1,268 @@
+"""State estimation from video: what can be measured in a scene, and the estimator interface.
+
+An environment declares what can be measured (`Physics`); a `StateEstimator` reads an `Observation`
+from video. Nothing here needs torch or a simulator.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.errors.plugin_code import WrongResultError, numbers
+
+if TYPE_CHECKING:
+    from acwm_core.model.shapes import Clip
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What can be seen in a video of T frames.
+
+    The simulator's own masks and states form an observation as well, so everything that is measured
+    in an estimated observation can also be measured in the ground truth.
+
+    Attributes:
+        masks: `[T, H, W]` uint8 instance ids, as on the environment's card.
+        states: some of the card's state fields under their own names, shapes and units, each
+            `[T, …]`; NaN where a value cannot be seen.
+    """
+
+    masks: NDArray[np.uint8]
+    states: Mapping[str, NDArray[Any]]
+
+
+States = Mapping[str, NDArray[Any]]
+"""The simulator's states in the first frame of a clip, by field, without a time axis."""
+
+Measure = Callable[[Observation, States], NDArray[np.float64]]
+"""Measures each frame of an observation: `[T]`, or `[T, n]` for a `Level`; NaN where unknown.
+
+The states of the first frame, which every model is given, tell what never changes and need not be
+estimated, e.g. the sizes of bodies and the positions of fixtures.
+"""
+
+
+class ViewingCamera(Protocol):
+    """The camera at nominal factors: projects points into frames of any size, and back.
+
+    Frame coordinates are x to the right and y down, from the frame's centre, in frame heights.
+    """
+
+    def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project world points `[…, 3]` in m to frame coordinates and depth in m, `[…, 3]`."""
+        ...
+
+    def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_frame`."""
+        ...
+
+    def on_plane(self, seen: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+        """Where rays through frame coordinates `[…, 2]` meet the plane z = `height`: `[…, 3]`."""
+        ...
+
+
+Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
+"""Rotations after which a body looks the same:
+
+* ``half_turn``, ``quarter_turn``: for an angle, rotations by π or π/2.
+* ``box``, ``cube``: for a quaternion, the 4 rotations of a box or the 24 of a cube.
+"""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A state field with positions or orientations of bodies.
+
+    Attributes:
+        field: its name on the card.
+        kind: ``position`` in m, the last axis x, y(, z); ``curve``, the points of one long body
+            from either end to the other; ``angle`` in rad; ``quaternion`` (w, x, y, z).
+        instances: name of the instance that each row of the field belongs to; one name for a
+            field without rows and for a curve.
+        symmetry: symmetry of the bodies; angles and quaternions are compared up to its rotations.
+        present: the state field that is 1 for rows that exist; empty if all do.
+        columns: which entries of the last axis to use; empty for all.
+    """
+
+    field: str
+    kind: Literal["position", "curve", "angle", "quaternion"]
+    instances: tuple[str, ...]
+    symmetry: Symmetry = "none"
+    present: str = ""
+    columns: tuple[int, ...] = ()
+
+    def of(self, states: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+        """Select its values `[T, …]` from the states of an observation or of the simulator."""
+        values = np.asarray(states[self.field], np.float64)
+        return values[..., list(self.columns)] if self.columns else values
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A conserved quantity.
+
+    Attributes:
+        name: e.g. ``"length of the forearm"``.
+        kind: ``length``, of a link or a rope, or ``amount``, of water or sand.
+        measure: measures it, in any unit; only relative changes count.
+        tolerance: largest relative change that is attributed to estimation errors.
+        lasting: number of consecutive frames that a change must last to count as real.
+    """
+
+    name: str
+    kind: Literal["length", "amount"]
+    measure: Measure
+    tolerance: float = 0.0
+    lasting: int = 3
+
+
+@dataclass(frozen=True)
+class Level:
+    """The surface height of something without a pose, such as sand or water.
+
+    Attributes:
+        name: e.g. ``"water in the container"``.
+        measure: heights in m at n places, `[T, n]`; NaN where unknown.
+    """
+
+    name: str
+    measure: Measure
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The distance between two bodies.
+
+    Attributes:
+        name: name of the kind of pair, e.g. ``"pusher-cube"``; pairs of a kind share thresholds.
+        pair: names of their instances.
+        measure: distance between their surfaces in m; if they overlap, minus the overlap depth.
+            For a fluid in a vessel, minus the depth of the fluid.
+        touch: distance in m below which bodies count as touching; None if touch cannot be inferred
+            from distance.
+        solid: overlap in m above which the bodies cannot be real; None for bodies that may pass
+            through each other.
+    """
+
+    name: str
+    pair: tuple[str, str]
+    measure: Measure
+    touch: float | None = None
+    solid: float | None = None
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What the physics metrics need to know about an environment.
+
+    Attributes:
+        readings: positions and orientations of bodies.
+        objects: instances that are one piece each, and neither appear nor disappear.
+        shapes: instances that have a shape instead of a pose: rope, cloth, sand, water.
+        levels: surface heights, e.g. of sand or water.
+        constants: conserved quantities.
+        gaps: distances of bodies that may touch.
+        lasting: number of consecutive frames for which an object must be missing, split or one too
+            many before it counts as real.
+        unseen: number of consecutive frames for which an object may be out of sight, whatever
+            hides it.
+        camera: the camera at nominal factors, for estimators that turn pixels into positions.
+    """
+
+    readings: tuple[Reading, ...] = ()
+    objects: tuple[str, ...] = ()
+    shapes: tuple[str, ...] = ()
+    levels: tuple[Level, ...] = ()
+    constants: tuple[Constant, ...] = ()
+    gaps: tuple[Gap, ...] = ()
+    lasting: int = 3
+    unseen: float = math.inf
+    camera: ViewingCamera | None = None
+
+
+class StateEstimator(ABC):
+    """Estimates masks and states from videos of one environment, without its simulator.
+
+    It is registered under the name of its environment, and constructed with the environment's card,
+    whose frame size is that of the videos. It sees only frames, neither actions nor ground truth,
+    and treats simulated and predicted videos alike.
+
+    One instance reads many clips, possibly several at once in different threads.
+
+    Args:
+        card: the environment's card.
+
+    Attributes:
+        card: the same.
+        fields: names of the state fields that it reads.
+        instances: names of the instances that its masks contain; all other pixels are 0.
+
+    Raises:
+        ShapeError: the card is not that of the environment: it lacks instances that are read.
+    """
+
+    fields: tuple[str, ...]
+    instances: tuple[str, ...]
+
+    def __init__(self, card: EnvironmentCard) -> None:
+        self.card = card
+
+    @property
+    @abstractmethod
+    def physics(self) -> Physics:
+        """What can be measured in its observations."""
+
+    def packages(self) -> tuple[str, ...]:
+        """Packages whose code determines its estimates; caches of scores depend on their hash."""
+        return (type(self).__module__.partition(".")[0],)
+
+    def provenance(self) -> Mapping[str, str]:
+        """What else its estimates depend on, e.g. the hash of a network's weights."""
+        return {}
+
+    @abstractmethod
+    def estimate(self, video: Clip) -> Observation:
+        """Estimate the masks of `instances` and the states `fields` of a video.
+
+        Args:
+            video: `[T, 3, H, W]` float in [0, 1], with H and W as on the card.
+
+        Raises:
+            ShapeError: the frames have another size.
+        """
+
+    def read(self, video: Clip) -> Observation:
+        """Call `estimate` and check its result; `WrongResultError` if it does not fit the video."""
+        seen: Any = self.estimate(video)
+        frames, _, *size = video.shape
+        if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
+            raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
+        masks = numbers(self, "estimate (masks)", seen.masks, frames, *size, dtype=np.uint8)
+        states = {**seen.states}
+        for field in (each for each in self.card.state if each.name in self.fields):
+            method, shape = f"estimate ({field.name})", (frames, *field.shape)
+            states[field.name] = found = numbers(self, method, states[field.name], *shape)
+            if np.isinf(found).any():
+                raise WrongResultError(self, method, math.inf, "finite numbers, or NaN")
+        return Observation(masks, states)
+
+    @abstractmethod
+    def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Project positions, estimated or true, to pixels.
+
+        Args:
+            field: one of `fields`, with positions or points of a curve.
+            values: `[…, D]` in m, as on the card.
+
+        Returns:
+            `[…, 2]`: x to the right and y down from the upper left corner, in pixels of a frame of
+            the card's size.
+        """

@@ -1,0 +1,283 @@
+"""The `Metric` interface: scores one predicted clip, and summarises many."""
+
+from __future__ import annotations
+
+import functools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import Episode
+from acwm_core.env.physics import Observation, StateEstimator
+from acwm_core.errors import PluginError, ShapeError
+from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
+
+if TYPE_CHECKING:
+    from acwm_core.model.shapes import Clip
+
+Result = TypeVar("Result")
+
+Numbers = Sequence[float] | NDArray[np.float64]
+"""One number per clip."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A predicted clip with the true clip and the simulator's ground truth.
+
+    Attributes:
+        prediction: `[T, 3, H, W]` float32 in [0, 1].
+        target: the simulated video, like `prediction`; frame 0 was given to the model.
+        actions: `[T, A]` raw actions.
+        states: ground-truth arrays by name, each `[T, …]`.
+        masks: `[T, H, W]` uint8 instance ids.
+        contacts: `[K, 3]` rows (frame, id, id).
+        card: the environment's card.
+        estimator: reads states and masks from video of this environment; None if there is none.
+        branches: rollouts of other actions from the same first frame, each with the video that the
+            simulator makes of them as `target`; empty unless requested.
+    """
+
+    prediction: Clip
+    target: Clip
+    actions: NDArray[np.float32]
+    states: Mapping[str, NDArray[Any]]
+    masks: NDArray[np.uint8]
+    contacts: NDArray[np.int32]
+    card: EnvironmentCard
+    estimator: StateEstimator | None = None
+    branches: tuple[Rollout, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        episode: Episode,
+        target: Clip,
+        prediction: Clip,
+        card: EnvironmentCard,
+        estimator: StateEstimator | None = None,
+    ) -> Rollout:
+        """Make a rollout from an episode, its video `target`, and a prediction of it."""
+        known = episode.actions, episode.states, episode.masks, episode.contacts
+        return cls(prediction, target, *known, card, estimator)
+
+    def check_shapes(self) -> None:
+        """Check that prediction and target can be compared.
+
+        Raises:
+            ShapeError: they differ in shape, or have no frames.
+        """
+        prediction, target = list(self.prediction.shape), list(self.target.shape)
+        if prediction != target or len(target) != 4 or not target[0]:
+            raise ShapeError(
+                f"metrics compare two clips [T, 3, H, W] of one shape, not {prediction} with "
+                f"{target}"
+            )
+
+    @functools.cached_property
+    def observed(self) -> Observation:
+        """The estimator's reading of the prediction, computed once for all metrics.
+
+        Raises:
+            PluginError: there is no estimator; a metric that needs one must say so in
+                `unavailable`.
+        """
+        if self.estimator is None:
+            raise PluginError(f"nothing reads states from video of {self.card.name}")
+        return self.estimator.read(self.prediction)
+
+    @functools.cached_property
+    def is_finite(self) -> bool:
+        """Whether the predictions of this rollout and all branches are free of NaN and infinity."""
+        own = bool(self.prediction.isfinite().all())
+        return own and all(branch.is_finite for branch in self.branches)
+
+    def once(self, key: object, work_out: Callable[[], Result]) -> Result:
+        """Compute a value that several metrics of this clip share, only once.
+
+        Args:
+            key: a unique key, such as the function that computes the value.
+            work_out: computes the value. Metrics share it, so they must not change it.
+        """
+        if key not in self._shared:
+            self._shared[key] = work_out()
+        return self._shared[key]
+
+    @functools.cached_property
+    def _shared(self) -> dict[object, Any]:
+        return {}
+
+
+Reads = Literal["pixels", "states"]
+"""What a metric uses of the predicted video: pixels (or features of them), compared with the true
+ones; or states that an estimator reads from it, whose errors give them a noise floor."""
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What tables and charts need to know about a metric; stored with the scores.
+
+    Attributes are those of `Metric`; `title` is ``""`` in results of older versions.
+    """
+
+    unit: str
+    higher_is_better: bool
+    title: str = ""
+    group: str = ""
+    reads: Reads = "states"
+    factor: float | None = None
+    rank: int = 100
+
+
+class Metric(ABC):
+    """A score of predicted video, computed in float32 and outside autocast.
+
+    One instance scores many clips, possibly several at once in different threads, so its methods
+    must not keep state between calls or change their arguments.
+
+    Attributes:
+        name: column name in results, e.g. ``"psnr"``.
+        title: name in tables, e.g. ``"PSNR"``; by default the name in words.
+        unit: e.g. ``"dB"``; ``""`` for none.
+        higher_is_better: whether higher values are better.
+        bounds: the lowest and highest possible score; confidence intervals end there.
+        group: heading above its column in tables, e.g. ``"Pixels"``.
+        reads: whether it compares pixels or reads states, see `Reads`.
+        factor: displayed values are multiplied by it; None chooses 1 or 1000 by their size.
+        rank: its order in tables, lowest first; the metric with the lowest rank orders the clips.
+        of_branches: whether it compares a clip with its branches. It is then measured only on the
+            clips of the counterfactual test (`evaluation.counterfactual_metrics`).
+    """
+
+    name: str
+    title: str = ""
+    unit: str = ""
+    higher_is_better: bool = False
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    group: str = "Other"
+    reads: Reads = "states"
+    factor: float | None = None
+    rank: int = 100
+    of_branches: bool = False
+
+    @property
+    def info(self) -> MetricInfo:
+        """What tables and charts need to know about it."""
+        title = self.title or self.name.replace("_", " ").capitalize()
+        shown = self.group, self.reads, self.factor, self.rank
+        return MetricInfo(self.unit, self.higher_is_better, title, *shown)
+
+    def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
+        """Why this environment cannot be scored, in one sentence; None if it can.
+
+        Args:
+            card: the environment's card.
+            estimator: the later `Rollout.estimator`.
+        """
+        return None
+
+    def provenance(self) -> Mapping[str, str]:
+        """What else the scores depend on, e.g. the hash of a network's weights."""
+        return {}
+
+    @abstractmethod
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """The score of each frame, `[T]`; NaN where it is not defined."""
+
+    def value(self, rollout: Rollout) -> float:
+        """The score of the whole clip; the mean over frames with a defined score unless overridden.
+
+        NaN means not defined; the clip then counts in no summary. It is called only for finite
+        predictions; others get the score `worst`.
+        """
+        return mean_of_defined(self.per_frame(rollout))
+
+    @property
+    def worst(self) -> float:
+        """The score of a prediction that is not finite: infinitely bad."""
+        return -math.inf if self.higher_is_better else math.inf
+
+    def weight(self, rollout: Rollout) -> float:
+        """Weight of the clip in `summarise`; 1 unless overridden."""
+        return 1.0
+
+    def curve(self, rollout: Rollout) -> NDArray[np.float64]:
+        """Call `per_frame`; `WrongResultError` unless the result has one number per frame."""
+        return numbers(self, "per_frame", self.per_frame(rollout), len(rollout.target))
+
+    def scored(
+        self, rollout: Rollout, curve: NDArray[np.float64] | None = None
+    ) -> tuple[float, float]:
+        """The value and weight of a clip; `worst` and 1 if the prediction is not finite.
+
+        Args:
+            curve: the result of `curve` for the clip, if it is known already.
+
+        Raises:
+            WrongResultError: they are not numbers, or the weight is negative or not finite.
+        """
+        if not rollout.is_finite:
+            return self.worst, 1.0
+        if type(self).value is Metric.value:
+            value = mean_of_defined(self.curve(rollout) if curve is None else curve)
+        else:
+            value = float(numbers(self, "value", self.value(rollout)))
+        weight = float(numbers(self, "weight", self.weight(rollout)))
+        if not 0 <= weight < math.inf:
+            raise WrongResultError(self, "weight", weight, "a finite number of at least 0")
+        return value, weight
+
+    def summed_up(self, values: Numbers, weights: Numbers | None = None) -> float:
+        """Call `summarise`; `PluginError` if it raises or its result is not a number."""
+        with blaming("when it sums clips up", self):
+            return float(numbers(self, "summarise", self.summarise(values, weights)))
+
+    def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
+        """Summarise many clips in one number: the weighted mean of the values unless overridden.
+
+        Args:
+            values: `value` of each clip; never NaN, but possibly `worst`.
+            weights: `weight` of each clip, times how often it counts; all equal if None.
+        """
+        return float(np.average(values, weights=weights))
+
+
+class SetMetric(Metric):
+    """A distance between the set of predicted clips and the set of true clips.
+
+    Single clips have no score; only summaries are reported. These have no confidence interval,
+    because such distances grow with fewer clips, and a resample has fewer different clips.
+    """
+
+    @abstractmethod
+    def features(self, rollout: Rollout) -> NDArray[np.float32]:
+        """Features of a clip: a vector for the prediction and one for the target, `[2, D]`."""
+
+    @abstractmethod
+    def distance(self, features: NDArray[np.float32]) -> float:
+        """The score of N clips from their `features`, `[N, 2, D]`; NaN if N is too small.
+
+        It is 0 for equal sets.
+        """
+
+    def distance_of(self, clips: Sequence[object]) -> float:
+        """Call `distance` on the `features` of clips; `PluginError` as in `summed_up`."""
+        with blaming("when it sums clips up", self):
+            features = numbers(self, "features", clips, len(clips), 2, -1).astype(np.float32)
+            return float(numbers(self, "distance", self.distance(features)))
+
+    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+        """All NaN, `[T]`: single frames have no score."""
+        return np.full(len(rollout.target), np.nan)
+
+
+def mean_of_defined(scores: NDArray[np.float64]) -> float:
+    """The mean of the scores that are not NaN; NaN if all are."""
+    defined = scores[~np.isnan(scores)]
+    return float(defined.mean()) if len(defined) else float("nan")

@@ -1,1 +1,0 @@
-"""Planning, as experiments and reports know it: its settings, and tasks that are planned."""

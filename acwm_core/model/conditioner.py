@@ -1,0 +1,135 @@
+"""The `Conditioner` interface: how actions enter a dynamics model.
+
+A conditioner owns its parameters, including any layers it adds between the model's own, so that
+the same model works with every conditioner.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, nn
+
+from acwm_core.errors.plugin_code import WrongResultError, shaped
+from acwm_core.model.shapes import Actions, Latent, Modulation, Sigmas, Tokens
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Embedded actions, computed once per clip and used at every sampling step and layer.
+
+    Attributes:
+        modulation: `[B, L, D]`, added to the timestep embedding of each latent frame (AdaLN), or
+            None.
+        context: `[B, L, K, D]`, K tokens per latent frame for what the conditioner does at the
+            input and after layers, or None.
+        conditioner: the conditioner that made this and whose layers apply it.
+        previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser trained with
+            `flow.objective=next_frame`; else None.
+        previous_sigma: noise level of each frame in `previous`, `[B, L]`.
+    """
+
+    modulation: Modulation | None
+    context: Tensor | None
+    conditioner: Conditioner
+    previous: Latent | None = None
+    previous_sigma: Sigmas | None = None
+
+    def inject_input(self, tokens: Tokens) -> Tokens:
+        """Let the conditioner change the tokens `[B, L, N, D]` before the model's first layer."""
+        return self.conditioner.inject_input(tokens, self)
+
+    def inject(self, layer: int, tokens: Tokens) -> Tokens:
+        """Pass tokens through the conditioner's layers after model layer `layer`.
+
+        Args:
+            layer: from 0.
+            tokens: `[B, L, N, D]`, where D is the model's `widths[layer]`.
+        """
+        return self.conditioner.inject(layer, tokens, self)
+
+    def frames(self, start: int, stop: int) -> Conditioning:
+        """The conditioning of latent frames `start` to `stop` only."""
+        modulation, context, previous, sigma = (
+            None if part is None else part[:, start:stop]
+            for part in (self.modulation, self.context, self.previous, self.previous_sigma)
+        )
+        return Conditioning(modulation, context, self.conditioner, previous, sigma)
+
+
+class Conditioner(nn.Module, ABC):
+    """Embeds actions for a dynamics model. It is built to fit the model, codec and environment.
+
+    Every conditioner takes these keyword arguments, which the framework fills in. Its own
+    parameters come after them and are set in the recipe.
+
+    Args:
+        action_size: number A of action dimensions.
+        temporal_stride: actions per latent frame, from the codec.
+        width: width D of modulation, context and the tokens at the input.
+        layers: number of layers of the model.
+        heads: number of attention heads of the model.
+        widths: width of the tokens after each layer, as `tuple[int, ...]`. Only a conditioner with
+            an `inject` of its own takes it; one that does not fits only models whose layers are all
+            as wide as `width`.
+
+    Attributes:
+        history: number of latent steps of actions, up to and including its own, on which the entry
+            of a latent frame depends; it may also look one step ahead. None means all steps since
+            the start, which rules out streaming.
+    """
+
+    history: int | None = None
+
+    @abstractmethod
+    def forward(self, actions: Actions) -> Conditioning:
+        """Embed actions `[B, T, A]`, normalised to [-1, 1], with T = 1 + (L − 1) · stride.
+
+        Row i leads from frame i to frame i + 1. Entry l of the result depends on no action later
+        than the last frame of latent frame l, whatever the model's attention in time. A conditioner
+        that looks further ahead must say so; streaming it would need that delay.
+        """
+
+    def condition(self, actions: Actions, frames: int, width: int) -> Conditioning:
+        """Call `forward`, and check its result for `frames` latent frames and model width `width`.
+
+        Raises:
+            WrongResultError: the result has the wrong type or shape.
+        """
+        made: object = self(actions)
+        if not isinstance(made, Conditioning):
+            raise WrongResultError(self, "forward", made, "a Conditioning")
+        if made.modulation is not None:
+            shaped(self, "modulation", made.modulation, len(actions), frames, width)
+        if made.context is not None:
+            shaped(self, "context", made.context, len(actions), frames, -1, width)
+        return made
+
+    def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Change the tokens `[B, L, N, D]` before the first layer; unchanged by default."""
+        return tokens
+
+    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Change the tokens after model layer `layer`; unchanged by default.
+
+        Args:
+            layer: from 0.
+            tokens: `[B, L, N, D]`, where D is the model's `widths[layer]`.
+            conditioning: what `forward` returned.
+
+        Returns:
+            Tokens of the same shape.
+        """
+        return tokens
+
+
+def takes_widths(conditioner: Callable[..., Any]) -> bool:
+    """Whether a conditioner's class, or a function that makes one, names the argument `widths`.
+
+    ``**others`` does not count, as it is often passed on to a class without it.
+    """
+    return "widths" in inspect.signature(conditioner).parameters

@@ -1,1 +1,0 @@
-"""Planning with a world model: tasks, and planners that choose actions to solve them."""

@@ -1,0 +1,66 @@
+"""Modules that were renamed: their old names are imported with a warning, for one release."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+from acwm_core.errors import RenamedWarning
+
+RENAMED = {
+    f"acwm_core.{old}": f"acwm_core.{new}"
+    for old, new in {
+        "assembly": "model.build",
+        "catalog": "plugins",
+        "codec": "model.codec",
+        "conditioner": "model.conditioner",
+        "denoiser": "model.denoiser",
+        "dynamics": "model.dynamics",
+        "environment": "env.environment",
+        "environment_card": "env.card",
+        "episode": "env.episode",
+        "estimator": "env.physics",
+        "hooks": "plugins",
+        "metric": "evaluation.metric",
+        "planning.task": "env.task",
+        "registry": "plugins",
+        "shapes": "model.shapes",
+        "statistics": "evaluation.statistics",
+        "streaming": "model.stream",
+        "world_model": "model.world_model",
+    }.items()
+}
+"""New names of the modules that packages of other authors import, by old name."""
+
+
+class RenamedModules(MetaPathFinder, Loader):
+    """Finds a renamed module by its old name: the same module object as by the new one."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Find a module that has a new name."""
+        if fullname == "acwm_core.planning":  # it held one of them
+            return ModuleSpec(fullname, self, is_package=True)
+        return ModuleSpec(fullname, self) if fullname in RENAMED else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """Import it by its new name, and say so."""
+        if spec.name not in RENAMED:
+            return None
+        message = f"{spec.name} is now called {RENAMED[spec.name]}"
+        warnings.warn(message, RenamedWarning, stacklevel=2)
+        return importlib.import_module(RENAMED[spec.name])
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Nothing is left to do: it was imported by its new name."""
+
+
+def find_renamed_modules() -> None:
+    """Let the old names be imported."""
+    sys.meta_path.append(RenamedModules())

@@ -1,1 +1,0 @@
-"""Shell completion of component names, recipes, and recipe keys with their values."""

@@ -1,1 +1,0 @@
-"""Inspects, checks, imports, exports and encodes datasets."""

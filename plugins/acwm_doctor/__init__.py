@@ -1,1 +1,0 @@
-"""Test what works on this machine."""

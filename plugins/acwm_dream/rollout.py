@@ -1,0 +1,229 @@
+"""Writes one prediction as a video file, from a chosen first frame and chosen actions."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from acwm_core.data.atomic import written_whole
+from acwm_core.data.card import CARD, DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.shards import UNREADABLE, from_npy
+from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.data.video import write_mp4
+from acwm_core.env.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.episode import SPLITS, Split
+from acwm_core.errors import (
+    ActionError,
+    AcwmWarning,
+    DataError,
+    RecipeError,
+    TrainingError,
+    suggest,
+)
+from acwm_core.evaluation import videos
+from acwm_core.evaluation.evaluate import check_actions, choose_device
+from acwm_core.model.shapes import Clip, Video, check_pixels
+from acwm_core.model.world_model import Mode
+from acwm_core.plugins import catalog
+from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.trained import find_run
+from acwm_core.untrusted import read_bytes
+
+SQUEEZED = 0.02
+"""A picture whose sides have another ratio than the frames, by so much, is not used silently."""
+
+Panels = tuple[NDArray[np.uint8], ...]
+"""The panels of one frame, `[H, W, 3]` each."""
+
+
+def rollout_run(
+    run: str | Path,
+    out: str | Path,
+    *,
+    data: str | Path | None = None,
+    split: str = "ind_test",
+    episode: int = 0,
+    actions: str | Path | None = None,
+    image: str | Path | None = None,
+    mode: Mode | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+) -> Path:
+    """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
+
+    By default, the context frames (as many as the model was trained with) and the actions come from
+    a recorded episode. The video then shows truth | prediction | difference. With other actions or
+    another picture, it shows the prediction only.
+
+    Args:
+        run: the run folder.
+        out: the ``.mp4`` or ``.png`` to write.
+        data: the data folder of the episode; that of the recipe by default. If the latter does not
+            exist, the same episode is simulated.
+        split, episode: split and number of the episode.
+        actions: a ``.npy`` file with raw actions `[N, A]`; every row leads to one more frame.
+        image: a picture to start from, resized to the environment's frame size; only for models
+            with a single context frame.
+        mode: how a long video is predicted; the model's own mode by default. Windows and streams
+            take any number of actions in constant memory.
+        steps: sampling steps; the flow's own number by default.
+        seed: seed of the sampling noise.
+        device: device of the model; ``"auto"`` takes a GPU if there is one.
+
+    Returns:
+        `out`.
+
+    Raises:
+        TrainingError: the folder holds no trained run, or the prediction is not finite.
+        RecipeError: the split, mode, device or file ending is unknown, or the model does not
+            support the request.
+        DataError: the episode does not exist or is too short, or a file cannot be read.
+        ActionError: the actions have the wrong shape, are not finite, or are out of bounds.
+    """
+    out = Path(out)
+    if out.suffix not in (".mp4", ".png"):
+        raise RecipeError(f"{out}: end its name in .mp4 for a video or .png for a sheet of frames")
+    if mode not in (None, *get_args(Mode)):
+        raise RecipeError(f"unknown mode {mode!r}{suggest(mode, get_args(Mode))}")
+    if split not in SPLITS:
+        raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
+    bundle = load_run(run)
+    given, rows, truth = None, None, None
+    known = bundle.world_model.context_frames
+    if actions is None or image is None:
+        place = data or bundle.recipe.data["path"]
+        if data or ":" in str(place) or (Path(place) / CARD).exists():
+            truth, rows = _recorded(EpisodeDataset(place, split), episode, bundle.card)
+        else:
+            truth, rows = _simulated(
+                DatasetCard.read(RunFolder(find_run(run)).card), split, episode
+            )
+        given = truth[:known]
+        if len(truth) <= known:
+            raise DataError(f"episode {episode} has {len(truth)} frames, and {known} are given")
+    if image is not None:
+        if known > 1:
+            raise RecipeError(f"this model starts from {known} frames, and --image gives one")
+        given, truth = _read_image(Path(image), bundle.card.frame_size)[None], None
+    if actions is not None:
+        asked = _read_actions(Path(actions), bundle.card.action)
+        before = np.zeros((0, asked.shape[1]), np.float32) if rows is None else rows[: known - 1]
+        rows, truth = np.concatenate([before, asked]), None
+    assert given is not None
+    assert rows is not None
+    model = bundle.world_model.to(choose_device(device))
+    where = model.action_low.device
+    seeds, taken = [seed], torch.tensor(rows)[None].to(where)
+    check_pixels(given)
+    model.checked(taken[:, :-1])
+    chunks = model.rollout_chunks(given[None].to(where), taken, mode=mode, steps=steps, seeds=seeds)
+    _write(out, _frames(chunks, truth), len(rows), bundle.card)
+    return out
+
+
+def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
+    """The panels of each frame: the prediction, between truth and difference if truth is known."""
+    start = 0
+    for chunk in chunks:
+        clip = chunk[0].cpu()
+        if not clip.isfinite().all():
+            raise TrainingError(
+                f"the prediction is not finite from frame {start} on: train the model again with "
+                "a lower training.learning_rate"
+            )
+        true = None if truth is None else truth[start : start + len(clip)]
+        shown = [videos.to_pixels(clip)] if true is None else videos.panels(true, clip)
+        yield from zip(*shown, strict=True)
+        start += len(clip)
+
+
+def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
+    """Write the file; only one chunk of the video is in memory at a time."""
+    scale = videos.magnification(card.frame_size[0])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".mp4":
+        joined = (videos.join(frame, axis=1) for frame in frames)
+        write_mp4(out, joined, card.fps, scale)
+    else:
+        wanted = strip_frames(count)
+        kept = [frame for index, frame in enumerate(frames) if index in wanted]
+        strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
+        with written_whole(out) as partial:
+            Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
+
+
+def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """A picture of evenly spaced frames of a clip, with one row per panel `[T, H, W, 3]`."""
+    shown = strip_frames(len(panels[0]))
+    rows = [videos.join([panel[index] for index in shown], axis=1) for panel in panels]
+    return videos.join(rows, axis=0)
+
+
+def strip_frames(frames: int) -> list[int]:
+    """Numbers of the frames, out of `frames`, that a frame strip shows."""
+    return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
+
+
+def _recorded(
+    dataset: EpisodeDataset, episode: int, card: EnvironmentCard
+) -> tuple[Clip, NDArray[np.float32]]:
+    check_actions(dataset, card)
+    if not 0 <= episode < len(dataset):
+        raise DataError(
+            f"{dataset.split} of {dataset.path} has no episode {episode}: it has 0 to "
+            f"{len(dataset) - 1}"
+        )
+    return torch.tensor(dataset.video(episode)).float() / 255, dataset.actions(episode)
+
+
+def _simulated(card: DatasetCard, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+    """Simulate the episode that the dataset would contain."""
+    if episode < 0:
+        raise DataError(f"episode {episode}: give 0 or more")
+    name = card.environment.name
+    if card.source or name not in catalog().registry("environment"):
+        raise DataError(f"no simulator of {name} is installed: give a dataset of it by --data")
+    made = simulate(make_environment(name, card.options), card.spec(split, episode))
+    return torch.tensor(made.video).permute(0, 3, 1, 2).float() / 255, made.actions
+
+
+def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
+    """Read a picture as `[3, H, W]` in [0, 1]."""
+    height, width = size
+    try:
+        with Image.open(path) as picture:
+            if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
+                warnings.warn(
+                    f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
+                    "pixels: crop it before, if it should keep its shape",
+                    AcwmWarning,
+                    stacklevel=2,
+                )
+            resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+    except (OSError, Image.DecompressionBombError, *UNREADABLE) as error:
+        raise DataError(f"{path} cannot be read as a picture: {error}") from error
+    return torch.tensor(np.asarray(resized)).permute(2, 0, 1).float() / 255
+
+
+def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
+    """Read actions as `[N + 1, A]`; the last row is zero, and no frame follows it."""
+    try:
+        rows = from_npy(read_bytes(path)).astype(np.float32)
+    except (OSError, *UNREADABLE) as error:
+        raise DataError(f"{path} cannot be read as a .npy array: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):
+        names = ", ".join(spec.names)
+        raise ActionError(f"{path} is of shape {rows.shape}, not (N, {spec.size}): {names}")
+    low, high = np.array([spec.low, spec.high], np.float32)  # rounded as the rows are
+    if not np.all((rows >= low) & (rows <= high)):  # so NaN is refused too
+        raise ActionError(f"{path} has actions outside their bounds, {spec.low} to {spec.high}")
+    return np.concatenate([rows, np.zeros((1, spec.size), np.float32)])

@@ -1,0 +1,141 @@
+"""Checks of dataset importers and exporters: what `acwm data` requires of them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import pickle
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.formats import DatasetExporter, DatasetImporter, export_dataset, options_of
+from acwm_core.data.recordings import RecordedDataset, Recording, import_dataset, recorded_card
+from acwm_core.env.environment import ActionSpec
+from acwm_core.plugins import catalog
+from acwm_formats.check import check_dataset
+
+MIN_PSNR = 25.0  # in dB; lossy video of smooth frames has more
+TAKEN = {"out", "workers", "data"}  # options that the commands define themselves
+
+
+class FormatChecks(Suite):
+    """Checks of every format, in an empty folder."""
+
+    @functools.cached_property
+    def _folder(self) -> Path:
+        self._kept = tempfile.TemporaryDirectory()  # until the checks are done
+        return Path(self._kept.name)
+
+    def documents_its_options(self) -> None:
+        """Give every parameter a type and a description in the docstring."""
+        for parameter, text in options_of(self.target):
+            name = parameter.name
+            expect(parameter.annotation is not inspect.Parameter.empty, f"{name} has no type")
+            expect(text, f"Args of the docstring do not say what {name} is")
+            expect(name not in TAKEN, f"{name} is an option of every format: call it otherwise")
+
+
+class DatasetImporterChecks(FormatChecks):
+    """Checks of an `acwm_core.data.formats.DatasetImporter` on its own example."""
+
+    kind = "dataset_importer"
+
+    def imports_its_example(self) -> None:
+        """Import the example as valid datasets, which are the same at a second import."""
+        (place := self._folder / "example").mkdir()
+        parameters = self.target.example(place)
+        expect_is_a(self.make(**parameters), DatasetImporter)
+        for at, recorded in _datasets(self.make(**parameters)).items():
+            card = _imported(recorded, self._folder / "one" / at)
+            found = check_dataset(self._folder / "one" / at)
+            problems = [str(each) for each in found if each.problem]
+            expect(not problems, "; ".join(problems))
+            expect("train" in card.splits, "nothing is there to train on")
+            again = _datasets(self.make(**parameters))[at]
+            same = _imported(again, self._folder / "two" / at) == card
+            expect(same, "a second import differs")
+            _read_backwards(recorded)
+
+
+class DatasetExporterChecks(FormatChecks):
+    """Checks of an `acwm_core.data.formats.DatasetExporter` on episodes of moving waves."""
+
+    kind = "dataset_exporter"
+
+    def writes_the_same_bytes_again(self) -> None:
+        """Write files, which are the same at a second call."""
+        action = ActionSpec(("x", "y"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "delta")
+        card = recorded_card("waves", action, frame_size=(32, 48), fps=10, horizon=8)
+        splits: Any = {"train": [_waves(0), _waves(1)], "ind_test": [_waves(2)]}
+        facts = {"kind": "example", "name": "waves"}
+        _imported(RecordedDataset(card, splits, facts), self._folder / "data")
+        expect_is_a(self.make(), DatasetExporter)
+        files: list[dict[Path, bytes]] = []
+        for out in (self._folder / "one", self._folder / "two"):
+            export_dataset(self._folder / "data", out, self.make(), progress=False)
+            found = [path for path in sorted(out.rglob("*")) if path.is_file()]
+            files.append({path.relative_to(out): path.read_bytes() for path in found})
+        expect(any(files[0].values()), "nothing is written")
+        expect(files[0] == files[1], "a second export differs")
+
+    def reads_back(self) -> None:
+        """Write files that the importer of the same name, if any, reads as the same episodes."""
+        importers = {each.name: each for each in catalog().registry("dataset_importer")}
+        if self.name not in importers:
+            return
+        found = _datasets(importers[self.name].load()(self._folder / "one"))
+        expect(len(found) == 1, f"it reads {len(found)} datasets")
+        back = _imported(next(iter(found.values())), self._folder / "back")
+        for split in back.splits:
+            before, after = (EpisodeDataset(self._folder / f, split) for f in ("data", "back"))
+            expect(before.lengths == after.lengths, f"{split} comes back with {after.lengths}")
+            for one, other in zip(before, after, strict=True):
+                expect(np.allclose(one.actions, other.actions, atol=1e-5), "actions change")
+                error = np.mean((one.video.astype(float) - other.video) ** 2)
+                expect(error < 255**2 / 10 ** (MIN_PSNR / 10), "the video comes back as another")
+
+
+def _read_backwards(recorded: RecordedDataset) -> None:
+    """Check that recordings do not depend on reading order: workers read copies, in any order."""
+    for split, recordings in recorded.splits.items():
+        copy = pickle.loads(pickle.dumps(recordings))
+        for index in reversed(range(len(recordings))):
+            pairs = zip(_arrays(recordings[index]), _arrays(copy[index]), strict=True)
+            same = all(np.array_equal(one, other) for one, other in pairs)
+            expect(same, f"recording {index} of {split} is another when it is read first")
+
+
+def _arrays(recording: Recording) -> list[Any]:
+    return [recording.video, recording.actions, *recording.states.values()]
+
+
+def _imported(recorded: RecordedDataset, out: Path) -> DatasetCard:
+    return import_dataset(recorded, out, workers=0, progress=False)
+
+
+def _waves(seed: int) -> Recording:
+    y, x, t = np.ogrid[0:32, 0:48, 0 : 6 + seed]
+    waves = 128 + 90 * np.sin(0.2 * y + 0.1 * x + 0.7 * t + seed)
+    video = np.repeat(np.moveaxis(waves, 2, 0)[..., None], 3, 3).astype(np.uint8)
+    return Recording(video, np.random.default_rng(seed).uniform(-1, 1, (5 + seed, 2)))
+
+
+def _datasets(importer: DatasetImporter) -> Mapping[str, RecordedDataset]:
+    found: Any = importer.read()
+    if isinstance(found, Mapping):
+        return cast(Mapping[str, RecordedDataset], found)
+    expect_is_a(found, RecordedDataset)
+    return {".": found}
+
+
+check_dataset_exporter = DatasetExporterChecks.check
+
+
+check_dataset_importer = DatasetImporterChecks.check

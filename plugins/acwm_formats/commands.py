@@ -1,0 +1,209 @@
+"""`acwm data`: inspect, check, import and export datasets."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, cast, get_args, get_origin
+
+import click
+
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
+from acwm_core.cli.tables import plain_table
+from acwm_core.plugins import Component, ComponentKind, Registry
+from acwm_core.untrusted import printable
+
+
+@click.group()
+def data() -> None:
+    """Inspect, check, import and export datasets."""
+
+
+@data.command()
+@click.argument("path", type=DATASET)
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+def info(path: Path, as_json: bool) -> None:
+    """Describe the dataset PATH, complete or not."""
+    from acwm_formats.preview import describe
+
+    facts = describe(path)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+    else:
+        _print_facts(facts)
+
+
+@data.command()
+@click.argument("path", type=DATASET)
+@click.option("--out", type=OUT_FOLDER, help="Folder; PATH/preview by default.")
+@click.option("--episodes", type=click.IntRange(1), default=4, help="Number of episodes per split.")
+def preview(path: Path, out: Path | None, episodes: int) -> None:
+    """Draw the first episodes as a picture and a video."""
+    from acwm_formats.preview import preview as draw
+
+    for file in draw(path, out or path / "preview", episodes=episodes):
+        click.echo(file)
+
+
+@data.command()
+@click.argument("path", type=DATASET)
+@click.option(
+    "--replays",
+    type=click.IntRange(0),
+    default=2,
+    help="Number of episodes per split to simulate again.",
+)
+def check(path: Path, replays: int) -> int:
+    """Verify a dataset and simulate some episodes again.
+
+    Verifies checksums and contents of PATH, and compares some episodes with new simulations. Exit
+    code 1 if something is wrong.
+    """
+    from acwm_formats.check import check_dataset
+
+    failed = 0
+    for finding in check_dataset(path, replays=replays):
+        failed += finding.problem is not None
+        click.echo(printable(str(finding)))
+    if failed:
+        click.echo(f"{failed} failed", err=True)
+    return int(failed > 0)
+
+
+def _print_facts(facts: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    height, width = facts["frame_size"]
+    click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
+    click.echo(f"{height}×{width} at {facts['fps']} fps, {facts['horizon']} frames per episode")
+    if facts["source"]:
+        click.echo(f"recorded: {facts['source']['name']} ({facts['source']['kind']})")
+        for note in facts["source"].get("notes", ()):
+            click.echo(f"  {note}")
+    else:
+        click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
+        if facts["exploration"]:
+            click.echo(f"{facts['exploration']:.0%} of the training episodes are exploratory")
+    columns = ("episodes", "made", "shards", "frames")
+    table = plain_table(None, "split", (*columns, "MB"))
+    for split, each in facts["splits"].items():
+        counts = [str(each[column]) for column in columns]
+        table.add_row(split, *counts, f"{each['bytes'] / 1e6:.1f}")
+    Console(highlight=False, markup=False).print(table)
+    for split, each in facts["splits"].items():
+        for label, count in each.get("ood_labels", {}).items():
+            click.echo(f"{split}: {count} episodes shift {label}")
+
+
+class FormatGroup(click.Group):
+    """Has one command per registered format, with the options of its class and those of `base`.
+
+    Args:
+        kind: kind of the registered components.
+        base: called with the component, a dict of its parameters, and the options of `base`.
+    """
+
+    def __init__(self, kind: ComponentKind, base: click.Command) -> None:
+        super().__init__(base.name, help=base.help)
+        self._kind: ComponentKind = kind
+        self._base = base
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names of the formats."""
+        return [component.name for component in self._registry()]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the formats without importing them."""
+        with formatter.section("Formats"):
+            formatter.write_dl([(each.name, each.summary) for each in self._registry()])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
+        """The command of a format; `UnknownNameError` suggests the closest name."""
+        from acwm_core.data.formats import options_of
+
+        component = self._registry()[cmd_name]
+        target = component.load()
+        own = [_parameter(*option, component.defaults) for option in options_of(target)]
+
+        def run(**values: Any) -> None:
+            given = {str(each.name): values.pop(str(each.name)) for each in own}
+            if self._base.callback:
+                self._base.callback(component, given, **values)
+
+        params = sorted([*own, *self._base.params], key=lambda p: isinstance(p, click.Option))
+        text = (inspect.getdoc(target) or "").partition("\nArgs:")[0]
+        return click.Command(cmd_name, params=params, callback=run, help=text)
+
+    def _registry(self) -> Registry:
+        from acwm_core.plugins import catalog
+
+        return catalog().registry(self._kind)
+
+
+def _parameter(
+    parameter: inspect.Parameter, text: str, presets: Mapping[str, Any]
+) -> click.Parameter:
+    name, default = parameter.name, presets.get(parameter.name, parameter.default)
+    settings: dict[str, Any] = {"type": _click_type(parameter.annotation)}
+    if default is parameter.empty:
+        settings["required"] = True
+    elif isinstance(default, tuple):  # as a user would type it
+        joint = "x" if settings["type"] is size else ","
+        settings["default"] = joint.join(map(str, cast(tuple[int, ...], default)))
+    else:
+        settings["default"] = default
+    if parameter.kind is not parameter.KEYWORD_ONLY:
+        return click.Argument([name], **settings)
+    word = name.replace("_", "-")
+    spelt = f"--{word}/--no-{word}" if parameter.annotation is bool else f"--{word}"
+    return click.Option([spelt], **settings, show_default=default is not None, help=text)
+
+
+def _click_type(annotation: Any) -> Any:
+    if get_origin(annotation) in (Union, UnionType):
+        kinds = {*get_args(annotation)} - {NoneType}
+        return size if kinds == {int, tuple[int, int]} else _click_type(kinds.pop())
+    if get_origin(annotation) is Literal:
+        return click.Choice(get_args(annotation))
+    known = {tuple[int, ...]: numbers, Path: click.Path(path_type=Path)}
+    return known.get(annotation, annotation)
+
+
+@click.command("import")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
+@click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
+def import_format(
+    component: Component, given: dict[str, Any], out: Path, workers: int | None
+) -> None:
+    """Import recordings in another format as a dataset.
+
+    If it is interrupted, run the same command again to continue.
+    """
+    from acwm_core.data.recordings import RecordedDataset, import_dataset
+
+    found = component.create(**given).read()
+    several = {".": found} if isinstance(found, RecordedDataset) else found
+    for name, recorded in several.items():
+        card = import_dataset(recorded, out / name, workers=workers)
+        made = ", ".join(f"{count} {split}" for split, count in card.splits.items())
+        click.echo(f"{out / name} holds {made} episodes of {card.environment.name}")
+        for note in card.source["notes"]:
+            click.echo(f"  {note}")
+        click.echo(f"next: acwm fit small data.path={out / name}")
+
+
+@click.command("export")
+@click.argument("data", type=DATASET)
+@click.option("--out", type=OUT_FOLDER, required=True, help="Folder to create.")
+def export_format(component: Component, given: dict[str, Any], data: Path, out: Path) -> None:
+    """Export a dataset to another format."""
+    from acwm_core.data.formats import export_dataset
+
+    click.echo(f"wrote {export_dataset(data, out, component.create(**given))}")
+
+
+data.add_command(FormatGroup("dataset_importer", import_format))
+data.add_command(FormatGroup("dataset_exporter", export_format))

@@ -1,0 +1,107 @@
+"""The `Planner`, `Cost` and `Driver` interfaces: who chooses actions, and what rates them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from acwm_core.env.physics import Observation
+from acwm_core.env.task import Frame, Goal, Task
+from acwm_core.model.shapes import Actions, Latent, Video
+
+RolloutCost = Callable[[Actions], Tensor]
+"""Maps N candidate sequences of raw actions `[N, T, A]` to costs `[N]`; NaN is worst."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Raw actions `[T, A]`, their expected cost, and how many candidates were evaluated."""
+
+    actions: Tensor
+    cost: float
+    evaluations: int
+
+
+class Planner(ABC):
+    """Finds the actions of lowest cost; it may keep state between the decisions of an episode."""
+
+    actions_per_plan: int  # how many actions are executed before it plans again
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget earlier decisions; called when an episode starts."""
+
+    @abstractmethod
+    def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
+        """Return the best actions found within the bounds `low` and `high`, each `[A]`.
+
+        All randomness comes from `rng`, on the CPU. `cost` may be called with actions that require
+        a gradient.
+        """
+
+
+class Futures(ABC):
+    """Predicted futures of N candidates.
+
+    `frames` are indices into the `length` planned latent frames; 0 is the next frame.
+    """
+
+    length: int
+
+    @abstractmethod
+    def latents(self, frames: Sequence[int]) -> Latent:
+        """Latents of these frames, `[N, len(frames), C, h, w]`."""
+
+    @abstractmethod
+    def video(self, frames: Sequence[int]) -> Video:
+        """The last video frame of each of these latent frames, `[N, len(frames), 3, H, W]`."""
+
+    @abstractmethod
+    def observe(self, frames: Sequence[int]) -> Observation:
+        """What these frames show, candidate after candidate, `[N · len(frames), …]`."""
+
+    @abstractmethod
+    def still(self, picture: Frame) -> Latent:
+        """The latent frame of a video in which `picture` stands still, `[1, 1, C, h, w]`."""
+
+
+class Cost(ABC):
+    """Rates how far futures are from what a task asks for."""
+
+    @abstractmethod
+    def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
+        """Return a cost per candidate, `[N]`; lower is better, NaN is worst."""
+
+
+class Driver(ABC):
+    """Solves a task in a simulator of which it sees pictures only, as in `acwm play`.
+
+    It is made with `world_model`, the `card` of the simulator, `task`, `usual` (standard deviation
+    `[A]` of the raw actions that the model was trained on, or None) and `steps` (sampling steps, or
+    None for the model's own number).
+    """
+
+    @abstractmethod
+    def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
+        """Aim at a goal from now on. `still` is the raw action `[A]` that means no motion now."""
+
+    @abstractmethod
+    def act(
+        self,
+        frames: Sequence[Frame],
+        actions: Sequence[NDArray[np.float32]],
+        check: Callable[[], None],
+    ) -> Sequence[NDArray[np.float32]]:
+        """The next raw actions, `[A]` each, at least one.
+
+        Args:
+            frames: the last frames, `[H, W, 3]` each, up to now.
+            actions: the raw actions between them, `[A]` each.
+            check: to be called often; it raises once nobody waits for the answer.
+        """

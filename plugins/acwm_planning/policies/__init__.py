@@ -1,0 +1,1 @@
+"""Ranks policies in a model, and tells how far the simulator agrees."""

@@ -1,0 +1,116 @@
+"""Statistics of how well two scores of the same policies agree, with bootstrap intervals."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from acwm_core.evaluation.statistics import CONFIDENCE, MIN_EPISODES, Estimate, defined
+from acwm_core.evaluation.statistics.bootstrap import with_interval
+from acwm_planning.policies.ranking import Agreement, Decisions
+
+Scores = NDArray[np.float64]
+
+RESAMPLES = 1000
+
+Statistic = Callable[[Scores, Scores], float]
+"""A function of a judge's scores `[P]` and the true scores `[P]`; NaN where it is not defined."""
+
+
+def mmrv(judge: Scores, truth: Scores) -> float:
+    """Mean maximum rank violation, as SimplerEnv defines it (Li et al. 2024, arXiv:2405.05941).
+
+    A pair of policies is violated if one is better in truth but not for the judge, or the other way
+    round. The violation is their true difference. A tie counts as not better, so a judge's tie
+    violates a true order. The result is the mean over policies of each policy's largest violation.
+    """
+    better = judge[:, None] > judge[None]
+    truly = truth[:, None] > truth[None]
+    gap = np.abs(truth[:, None] - truth[None])
+    return float(np.where(better != truly, gap, 0.0).max(1).mean())
+
+
+def _correlation(name: str) -> Statistic:
+    def statistic(judge: Scores, truth: Scores) -> float:
+        if len(judge) < 2 or np.ptp(judge) == 0 or np.ptp(truth) == 0:
+            return math.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", stats.NearConstantInputWarning)
+            return float(getattr(stats, name)(judge, truth).statistic)
+
+    return statistic
+
+
+STATISTICS: Mapping[str, Statistic] = {
+    "pearson": _correlation("pearsonr"),
+    "spearman": _correlation("spearmanr"),
+    "kendall": _correlation("kendalltau"),  # τ-b, which accounts for ties
+    "mmrv": mmrv,
+    "optimism": lambda judge, truth: float((judge - truth).mean()),
+}
+
+
+def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESAMPLES) -> Agreement:
+    """Compute how well scores agree, over policies and episodes.
+
+    Intervals are percentiles over bootstrap resamples of the policies and, independently, of the
+    episodes that all policies share. With fewer than `MIN_EPISODES` episodes, only policies are
+    resampled. There is no interval with fewer than `MIN_EPISODES` policies, or if the statistic is
+    defined in less than half of the resamples.
+
+    Args:
+        judge: the judge's scores `[P, E]` of policies in episodes.
+        truth: the true scores `[P, E]`.
+        seed: seed of the resampling.
+        resamples: number of resamples.
+    """
+    policies, episodes = truth.shape
+    rng = np.random.default_rng(seed)
+    drawn: dict[str, list[float]] = {name: [] for name in STATISTICS}
+    every, several = np.arange(episodes), episodes >= MIN_EPISODES
+    for _ in range(resamples if policies >= MIN_EPISODES else 0):
+        rows = rng.integers(policies, size=policies)
+        columns = rng.integers(episodes, size=episodes) if several else every
+        one, other = (each[rows][:, columns].mean(1) for each in (judge, truth))
+        for name, statistic in STATISTICS.items():
+            drawn[name].append(statistic(one, other))
+    values = {
+        name: _estimate(each(judge.mean(1), truth.mean(1)), np.array(drawn[name]))
+        for name, each in STATISTICS.items()
+    }
+    return Agreement(**values)
+
+
+def _estimate(value: float, drawn: Scores) -> Estimate:
+    kept = drawn[np.isfinite(drawn)]
+    if math.isnan(value) or not len(kept) or len(kept) < len(drawn) / 2:
+        return Estimate(defined(value))
+    low, high = np.quantile(kept, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def regret(judge: Scores, truth: Scores) -> tuple[float, float]:
+    """Regret of a judge's choice among the action sequences of a start, and of a random choice.
+
+    Args:
+        judge: the judge's returns `[n]` of the sequences. Among sequences that tie for the best,
+            the choice is random.
+        truth: the true returns `[n]`.
+    """
+    chosen = truth[judge == judge.max()].mean()
+    return float(truth.max() - chosen), float(truth.max() - truth.mean())
+
+
+def decisions(judge: list[Scores], truth: list[Scores]) -> Decisions:
+    """Regrets of choices at many starts, with intervals over the starts."""
+    lost = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
+    means = [
+        with_interval(float(each.mean()), [each])
+        for each in (lost[:, 0], lost[:, 1], lost[:, 1] - lost[:, 0])
+    ]
+    return Decisions(len(lost), *means)

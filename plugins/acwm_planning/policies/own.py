@@ -1,0 +1,95 @@
+"""Users' own policies: a function, an object with `predict`, or a torch module."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.task import Frame, Goal
+from acwm_core.errors import RecipeError
+from acwm_core.errors.plugin_code import blaming, named_by_user
+
+
+class OwnPolicy:
+    """A user's policy, named by ``module:name`` and asked for an action once per latent frame.
+
+    It is one of the following, or a class that creates one when called without arguments:
+
+    * a torch module: takes a frame ``[1, 3, H, W]`` in [0, 1] and returns ``[1, A]``;
+    * an object with `predict`, as in stable-baselines3: takes ``[H, W, 3]`` uint8 and returns an
+      action ``[A]``, or a tuple that begins with it;
+    * any other callable: takes and returns the same as `predict`.
+
+    With an attribute ``observes = "state"`` it gets the states that an estimator reads, a mapping
+    by field, instead of the frame. If it has a method `reset`, this is called with the `Goal` when
+    an episode starts.
+
+    Args:
+        name: ``module:name`` of the policy.
+        card: card of the environment.
+
+    Raises:
+        RecipeError, PluginError: there is no such policy, or it cannot act.
+    """
+
+    def __init__(self, name: str, card: EnvironmentCard) -> None:
+        self.name, self._card = name, card
+        made = named_by_user(name, f"the policy {name}")
+        if isinstance(made, type):
+            made = self._asked("made", made)
+        if not (callable(getattr(made, "predict", None)) or callable(made)):
+            raise RecipeError(f"the policy {name} is not callable and has no predict()")
+        self._policy: Any = made.eval() if isinstance(made, torch.nn.Module) else made
+        self.observes = getattr(made, "observes", "frame")
+        if self.observes not in ("frame", "state"):
+            raise RecipeError(f"the policy {name} observes {self.observes!r}: frame or state")
+
+    def reset(self, goal: Goal) -> None:
+        """Start an episode."""
+        reset = getattr(self._policy, "reset", None)
+        if callable(reset):
+            self._asked("reset", reset, copy.deepcopy(goal))  # the policy may modify it
+
+    def act(self, frame: Frame, state: Mapping[str, NDArray[Any]] | None) -> NDArray[np.float32]:
+        """Choose the next action `[A]`, clipped to its bounds.
+
+        Args:
+            frame: the current frame, `[H, W, 3]` uint8.
+            state: states that an estimator read from it, if the policy observes them.
+
+        Raises:
+            RecipeError, PluginError: the policy fails, or does not return an action.
+        """
+        if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
+            picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
+            with torch.no_grad():
+                made = self._asked("called", self._policy, picture)
+            made = made[0].cpu().numpy() if isinstance(made, torch.Tensor) else made
+        else:
+            act = getattr(self._policy, "predict", self._policy)
+            made = self._asked("called", act, frame if self.observes == "frame" else state)
+            made = made[0] if isinstance(made, tuple) else made
+        spec = self._card.action
+        with blaming("when called", f"the policy {self.name}"):
+            action = np.asarray(made)
+        if action.shape != (spec.size,) or not is_finite(action):
+            raise RecipeError(
+                f"the policy {self.name} returned an array of shape {np.shape(made)}, but "
+                f"{self._card.name} needs {spec.size} finite numbers"
+            )
+        return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
+
+    def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
+        with blaming(f"when {doing}", f"the policy {self.name}"):
+            return function(*arguments)
+
+
+def is_finite(numbers: NDArray[Any]) -> bool:
+    """Whether all are finite real numbers."""
+    return numbers.dtype.kind in "fiu" and bool(np.isfinite(numbers).all())

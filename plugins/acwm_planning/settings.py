@@ -1,0 +1,129 @@
+"""Settings of planning: presets and overrides from the command line, checked without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, get_type_hints
+
+from acwm_core.errors import RecipeError, suggest
+from acwm_core.recipe.check import check_component
+from acwm_core.recipe.compose import parse_override
+from acwm_core.recipe.types import checked
+
+ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
+"""What chooses the actions: the planner with the model; the same planner with the true simulator;
+the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
+policy; random actions; no motion."""
+
+PRESETS: Mapping[str, Sequence[str]] = {
+    "default": ("planner=icem", "cost=latent"),
+    # The settings of stable-worldmodel: whole plans are executed, and only their end is judged.
+    "stable_worldmodel": (
+        *("planner=cem", "planner.candidates=300", "planner.iterations=30", "planner.elites=30"),
+        *("planner.horizon=5", "planner.action_block=5", "planner.actions_per_plan=25"),
+        *("planner.spread=1.0", "cost=latent", "cost.frames=1", "goal_ahead=25", "max_steps=50"),
+    ),
+}
+"""Overrides of each preset; those of the command line are applied after them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that determines how an episode is planned, except the model.
+
+    Attributes:
+        planner: name and parameters of the planner.
+        cost: name and parameters of the cost.
+        past: see `ModelRollouts`.
+        steps: see `ModelRollouts`.
+        batch: see `ModelRollouts`.
+        max_steps: maximum number of actions in an episode; the task's own by default.
+        goal_ahead: the goal is the state that the behaviour policy reaches from the start after
+            this many frames; the task's own goals by default.
+    """
+
+    planner: dict[str, Any]
+    cost: dict[str, Any]
+    past: int = 0
+    steps: int | None = None
+    batch: int = 128
+    max_steps: int | None = None
+    goal_ahead: int | None = None
+
+    def __post_init__(self) -> None:
+        least = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
+        for name, lowest in least.items():
+            value = getattr(self, name)
+            if value is not None and value < lowest:
+                raise RecipeError(f"{name}={value}: give {lowest} or more")
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the cost may need states, which an estimator reads."""
+        return self.cost["name"] != "latent"
+
+    @property
+    def differentiates(self) -> bool:
+        """Whether the planner needs gradients, which the simulator does not have."""
+        return self.planner["name"] == "gradient"
+
+    def rollouts(self) -> dict[str, Any]:
+        """The parameters of `ModelRollouts`."""
+        return {"past": self.past, "steps": self.steps, "batch": self.batch}
+
+    def rows(self, asked: Collection[str]) -> list[str]:
+        """The rows to play of those that are asked for, in the order of `ROWS`.
+
+        A cost on latents is the same through the codec, so then there is no such row.
+
+        Raises:
+            RecipeError: there is no such row.
+        """
+        for row in asked:
+            if row not in ROWS:
+                raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
+        return [row for row in ROWS if row in asked and (row != "codec" or self.estimates)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings that affect results, ready for JSON; the batch size does not."""
+        return {name: value for name, value in asdict(self).items() if name != "batch"}
+
+
+def settings_of(
+    overrides: Sequence[str], preset: str = "default", declared: Sequence[str] = ()
+) -> Settings:
+    """Build the settings from a preset and overrides, checked in the same way as a recipe.
+
+    Args:
+        overrides: e.g. ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``;
+            their order does not matter.
+        preset: one of `PRESETS`.
+        declared: overrides of the task (`Task.planning`). They apply to the default preset only,
+            and before `overrides`.
+
+    Raises:
+        RecipeError: a preset, component or parameter does not exist, or a value is wrong.
+    """
+    if preset not in PRESETS:
+        raise RecipeError(f"unknown preset {preset!r}{suggest(preset, PRESETS)}")
+    components: dict[str, dict[str, Any]] = {"planner": {}, "cost": {}}
+    plain: dict[str, Any] = {}
+    types = get_type_hints(Settings)
+    known = [each.name for each in fields(Settings)]
+    own = declared if preset == "default" else ()
+    for words in (PRESETS[preset], own, overrides):
+        parsed = [parse_override(word) for word in words]
+        # names first: a new name drops the parameters of the previous component
+        for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
+            for name, value in given.items():
+                if name not in known:
+                    raise RecipeError(f"{name} is not a setting of planning{suggest(name, known)}")
+                if name not in components:
+                    plain[name] = checked(name, value, types[name])
+                elif isinstance(value, dict):
+                    components[name] |= value
+                elif value != components[name].get("name"):
+                    components[name] = {"name": value}
+    made = {name: check_component(name, choice) for name, choice in components.items()}
+    return Settings(**made, **plain)

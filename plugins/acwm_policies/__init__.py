@@ -1,1 +1,0 @@
-"""Ranking policies in a world model: scripted ones, users' own, and how far the truth agrees."""

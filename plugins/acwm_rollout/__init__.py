@@ -1,1 +1,0 @@
-"""Writes one prediction of a trained model as a video."""

@@ -1,0 +1,1 @@
+"""Errors against a factor: what `acwm evaluate --sweep` simulates, scores and keeps."""
