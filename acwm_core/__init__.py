@@ -19,7 +19,7 @@ def __getattr__(name: str) -> str:
 
 def main() -> None:
     """Entry point of the program `acwm`: handle Ctrl-C, then run the command line."""
-    from acwm_core.errors import handle_interrupts
+    from acwm_core.interrupts import handle_interrupts
 
     handle_interrupts()
     import importlib

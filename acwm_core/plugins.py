@@ -30,7 +30,7 @@ from typing import Any, Literal, TypeVar, cast, get_args
 import pluggy
 
 from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
-from acwm_core.errors.plugin_code import (
+from acwm_core.plugin_code import (
     blaming,
     explained,
     importing,

@@ -1,16 +1,37 @@
-"""Modules that were renamed: their old names are imported with a warning, for one release."""
+"""Old names of modules, keys and options: they still work, with a warning, for one release."""
 
 from __future__ import annotations
 
 import importlib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
-from acwm_core.errors import RenamedWarning
+
+class RenamedWarning(FutureWarning):
+    """An old name was used; it works for one more release."""
+
+
+def with_new_names(
+    values: Mapping[str, Any], renamed: Mapping[str, str], where: str = ""
+) -> dict[str, Any]:
+    """Return `values` under their new names, with a `RenamedWarning` for every old name.
+
+    Args:
+        values: values by name, from a file or a command line.
+        renamed: maps old names to new ones.
+        where: prefix of the names in the warning, e.g. ``"evaluation."``.
+    """
+    for old in values:
+        if old in renamed:
+            message = f"{where}{old} is now called {where}{renamed[old]}"
+            warnings.warn(message, RenamedWarning, stacklevel=2)
+    return {renamed.get(name, name): value for name, value in values.items()}
+
 
 RENAMED = {
     f"acwm_core.{old}": f"acwm_core.{new}"

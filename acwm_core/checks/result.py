@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from acwm_core.errors import PluginError
-from acwm_core.errors.plugin_code import explained, is_by_an_author, is_true_stop
+from acwm_core.plugin_code import explained, is_by_an_author, is_true_stop
 from acwm_core.plugins import ComponentKind, catalog
 
 Checked = str | Callable[..., Any]

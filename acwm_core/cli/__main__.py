@@ -4,7 +4,7 @@ import os
 import threading
 
 from acwm_core.cli.main import main
-from acwm_core.errors import handle_interrupts
+from acwm_core.interrupts import handle_interrupts
 
 ENDS_WITH_INPUT = "ACWM_ENDS_WITH_INPUT"
 """Environment variable that makes a command end once its standard input is closed."""

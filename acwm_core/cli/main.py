@@ -19,16 +19,11 @@ from acwm_core.cli.doctor import doctor
 from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
-from acwm_core.errors import (
-    INTERRUPTED,
-    AcwmError,
-    AcwmWarning,
-    PluginError,
-    RenamedWarning,
-    suggest,
-)
-from acwm_core.errors.plugin_code import blaming
+from acwm_core.errors import AcwmError, AcwmWarning, PluginError, suggest
+from acwm_core.interrupts import INTERRUPTED
+from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
+from acwm_core.renamed import RenamedWarning
 from acwm_core.untrusted import printable
 
 

@@ -18,9 +18,9 @@ from acwm_core.data.clips import padded_video
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.latents import LatentFolder
 from acwm_core.errors import DamagedShardError, DataError
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.executors import Report, progress_bar
 from acwm_core.model.codec import Codec
+from acwm_core.plugin_code import blaming
 
 
 def encode_windows(

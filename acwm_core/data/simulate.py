@@ -26,8 +26,8 @@ from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError, expect
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.executors import Report
+from acwm_core.plugin_code import blaming
 from acwm_core.plugins import Component, catalog
 
 EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors.plugin_code import WrongResultError, numbers
+from acwm_core.plugin_code import WrongResultError, numbers
 
 if TYPE_CHECKING:
     from acwm_core.model.shapes import Clip

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.physics import Observation
 from acwm_core.errors import PluginError, RecipeError
-from acwm_core.errors.plugin_code import WrongResultError, numbers
+from acwm_core.plugin_code import WrongResultError, numbers
 
 Frame = NDArray[np.uint8]
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import PREDICTORS, Batch, ClipPlan, Predictor, batches, load_samples
 from acwm_core.evaluation.config import EvaluationConfig
@@ -33,6 +32,7 @@ from acwm_core.evaluation.videos import case_study
 from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.shapes import Actions, Video
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 
 Results = Mapping[str, list[ClipResult]]
 """Results by split."""

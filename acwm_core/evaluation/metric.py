@@ -16,7 +16,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import PluginError, ShapeError
-from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
+from acwm_core.plugin_code import WrongResultError, blaming, numbers
 
 if TYPE_CHECKING:
     from acwm_core.model.shapes import Clip

@@ -12,11 +12,11 @@ import torch
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.evaluation.metric import Metric, Rollout, SetMetric
 from acwm_core.model.shapes import Clip
+from acwm_core.plugin_code import WrongResultError, blaming, numbers
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 

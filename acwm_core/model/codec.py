@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.errors.plugin_code import shaped
 from acwm_core.model.shapes import Latent, Video
+from acwm_core.plugin_code import shaped
 
 FrameDecoder = Callable[[Latent], Video]
 """Maps the next latent frames `[B, k, C, h, w]` to their video frames."""

@@ -14,8 +14,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from acwm_core.errors.plugin_code import WrongResultError, shaped
 from acwm_core.model.shapes import Actions, Latent, Modulation, Sigmas, Tokens
+from acwm_core.plugin_code import WrongResultError, shaped
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import shaped
 from acwm_core.model import next_frame
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, DynamicsModel, LatentStream
 from acwm_core.model.flow import Flow, drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
+from acwm_core.plugin_code import shaped
 
 
 class Denoiser(DynamicsModel):

@@ -19,11 +19,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from acwm_core.errors.plugin_code import shaped
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, LatentStream
 from acwm_core.model.flow import Flow, drawn_noise, mix
 from acwm_core.model.shapes import Latent, Sigmas
+from acwm_core.plugin_code import shaped
 
 
 class Extendable(Protocol):

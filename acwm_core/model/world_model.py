@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import ActionError, RecipeError, ShapeError
-from acwm_core.errors.plugin_code import WrongResultError, shaped
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.model.stream import Stream, continued
+from acwm_core.plugin_code import WrongResultError, shaped
 
 CLIP_FRAMES = 37
 """Frames per clip: 10 latent frames at a temporal stride of 4 (the published window)."""

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.errors import DataError, RecipeError, suggest, with_new_names
+from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_core.recipe.text import parse
+from acwm_core.renamed import with_new_names
 from acwm_core.untrusted import MAX_YAML, read_bytes
 
 OVERLAYS = "overlays"

@@ -14,9 +14,9 @@ from torch.distributed.tensor import DTensor
 from torch.optim import AdamW, Muon, Optimizer
 
 from acwm_core.errors import AcwmWarning
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.model.dynamics import hidden_matrices
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 from acwm_core.training.config import TrainingConfig
 
 

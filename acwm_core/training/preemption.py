@@ -20,7 +20,8 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import distributed
 
-from acwm_core.errors import INTERRUPTED, TrainingError
+from acwm_core.errors import TrainingError
+from acwm_core.interrupts import INTERRUPTED
 from acwm_core.training.callbacks import stepped
 from acwm_core.training.checkpoints import last_whole
 from acwm_core.training.run import RunFolder

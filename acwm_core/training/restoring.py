@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 
 from acwm_core.data.atomic import disk_error
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.errors.plugin_code import explained
+from acwm_core.plugin_code import explained
 
 if TYPE_CHECKING:
     from acwm_core.training.task import WorldModelTask

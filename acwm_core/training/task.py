@@ -16,9 +16,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from acwm_core.errors import TrainingError
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.layers import recompute_activations, shard, trained_layers

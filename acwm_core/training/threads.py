@@ -13,8 +13,8 @@ from typing import Any, cast
 import lightning as L
 import torch
 
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.task import check_gradient
 

@@ -17,11 +17,11 @@ from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
+from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (

@@ -14,7 +14,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.errors.plugin_code import blaming
+from acwm_core.plugin_code import blaming
 
 
 class Start(NamedTuple):

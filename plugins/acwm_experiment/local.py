@@ -13,8 +13,8 @@ from datetime import datetime, timedelta
 from typing import NamedTuple
 
 from acwm_core.cli.__main__ import ENDS_WITH_INPUT
-from acwm_core.errors import exit_by_signal
 from acwm_core.executors import available_cores
+from acwm_core.interrupts import exit_by_signal
 from acwm_experiment.logs import StepLogs
 from acwm_experiment.steps import Step
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import WrongResultError, numbers
+from acwm_core.plugin_code import WrongResultError, numbers
 from acwm_planning.futures import History
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_planning.search import SearchPlanner

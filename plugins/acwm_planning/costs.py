@@ -8,7 +8,7 @@ from torch import Tensor
 
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import WrongResultError, named_by_user
+from acwm_core.plugin_code import WrongResultError, named_by_user
 from acwm_planning.planner import Cost, Futures
 
 

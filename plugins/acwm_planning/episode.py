@@ -11,7 +11,7 @@ from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, TaskEnvironment
-from acwm_core.errors.plugin_code import blaming, mark
+from acwm_core.plugin_code import blaming, mark
 from acwm_planning.controllers import Controller, Decision, Planned
 from acwm_planning.futures import History
 

@@ -16,11 +16,11 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.errors.plugin_code import shaped
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import shaped
 from acwm_planning.planner import Cost, Futures, RolloutCost
 
 

@@ -13,9 +13,9 @@ from acwm_core.env.environment import Environment
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task, observed
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import shaped
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Actions, Latent, Video
+from acwm_core.plugin_code import shaped
 from acwm_planning.futures import History, still_latent, tensor_of
 from acwm_planning.planner import Cost, Futures, RolloutCost
 

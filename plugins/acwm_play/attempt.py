@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError
-from acwm_core.errors.plugin_code import WrongResultError, blaming, numbers
+from acwm_core.plugin_code import WrongResultError, blaming, numbers
 from acwm_planning.planner import Driver
 from acwm_play.simulator import Moment
 from acwm_play.stage import Stage

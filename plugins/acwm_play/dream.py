@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 
 Frames = NDArray[np.uint8]
 

@@ -56,7 +56,7 @@ def test_a_hanging_import_is_named(
     install("plugin_hangs", hang)
     (tmp_path / "hanging_target.py").write_text(f"{hang}class Codec: pass\n")
     with said.open("w") as told:
-        monkeypatch.setattr("acwm_core.errors.plugin_code.PATIENCE", 0.01)
+        monkeypatch.setattr("acwm_core.plugin_code.PATIENCE", 0.01)
         monkeypatch.setattr("sys.__stderr__", told)
         loaded()
         assert "plugin 'plugin_hangs' (plugin_hangs) has been importing for" in said.read_text()

@@ -14,9 +14,10 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
+from acwm_core import plugin_code
 from acwm_core.cli import main
 from acwm_core.cli.main import AcwmGroup
-from acwm_core.errors import exit_by_signal, plugin_code
+from acwm_core.interrupts import exit_by_signal
 from acwm_core.plugins import COMPONENT_KINDS, catalog
 from acwm_core.recipe import compose
 

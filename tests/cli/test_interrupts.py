@@ -11,7 +11,7 @@ import pytest
 def program(tmp_path, body):
     """A process that Ctrl-C reaches at a known place, after acwm took care of it."""
     script = tmp_path / "program.py"
-    start = "from acwm_core.errors import handle_interrupts\nhandle_interrupts()\n"
+    start = "from acwm_core.interrupts import handle_interrupts\nhandle_interrupts()\n"
     script.write_text(start + textwrap.dedent(body))
     ended = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=600
@@ -74,13 +74,13 @@ def test_workers_leave_it_to_the_command(tmp_path):
 
 def test_the_program_is_told_first_of_all():
     """Before anything that takes time is imported."""
-    told = "import acwm_core.errors, sys; print(*{'click', 'numpy', 'email'} & {*sys.modules})"
+    told = "import acwm_core.interrupts, sys; print(*{'click', 'numpy', 'email'} & {*sys.modules})"
     ended = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
     assert ended.stdout == "\n"
 
 
 def test_a_background_job_that_ignores_it_still_does(tmp_path):
-    script = "from acwm_core.errors import *; import os\nhandle_interrupts()\n"
+    script = "from acwm_core.interrupts import *; import os\nhandle_interrupts()\n"
     script += "os.kill(os.getpid(), signal.SIGINT); print('went on')"
     ended = subprocess.run(
         [sys.executable, "-c", script],

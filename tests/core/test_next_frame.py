@@ -5,13 +5,13 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import WrongResultError
 from acwm_core.model import next_frame
 from acwm_core.model.build import build_model
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.dynamics import Cache
 from acwm_core.model.flow import Flow
+from acwm_core.plugin_code import WrongResultError
 from acwm_core.recipe import ComponentConfig
 from acwm_dit.dit import DiT
 

@@ -11,7 +11,7 @@ from acwm_core.cli import main
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import PluginError
-from acwm_core.errors.plugin_code import blaming
+from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from tests.evaluation import author, tiny
 

@@ -18,8 +18,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.generate import generate
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
-from acwm_core.errors.plugin_code import WrongResultError
 from acwm_core.model.build import build_world_model
+from acwm_core.plugin_code import WrongResultError
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from tests.evaluation import tiny

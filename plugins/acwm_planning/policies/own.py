@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Frame, Goal
 from acwm_core.errors import RecipeError
-from acwm_core.errors.plugin_code import blaming, named_by_user
+from acwm_core.plugin_code import blaming, named_by_user
 
 
 class OwnPolicy:

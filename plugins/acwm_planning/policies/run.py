@@ -15,12 +15,12 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.simulator import plan_branches
 from acwm_core.executors import progress_bar
+from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run

@@ -14,7 +14,7 @@ from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.errors.plugin_code import WrongResultError, numbers
+from acwm_core.plugin_code import WrongResultError, numbers
 
 Script = Literal["solution", "behaviour"]
 

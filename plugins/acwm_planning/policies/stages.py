@@ -13,9 +13,9 @@ from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task, TaskEnvironment
-from acwm_core.errors.plugin_code import blaming
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugin_code import blaming
 from acwm_planning.policies.episode import Outcome, Played, Start, joined, judged, outcome
 from acwm_planning.policies.own import OwnPolicy
 

@@ -1,0 +1,201 @@
+"""Errors for users: one clear sentence that says what to do next, and notes of where it arose.
+
+For every `AcwmError`, the command line prints only the message and exits with code 2. It does so
+too for an error of a component, which carries a note that says where it arose. An error without a
+note is a bug in acwm and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import traceback
+from collections.abc import Generator, Iterable
+from pathlib import Path
+from typing import Any
+
+
+class AcwmError(Exception):
+    """Base of every error a user can cause and fix."""
+
+    exit_code = 2
+
+
+class RecipeError(AcwmError):
+    """A recipe or an override is wrong: unknown component, parameter, type or file."""
+
+
+class UnknownNameError(RecipeError):
+    """Nothing is registered under a name.
+
+    Args:
+        kind: what was looked for, e.g. ``"environment"``.
+        name: the name that was not found.
+        known: the existing names, to suggest the most similar one.
+        hint: a last sentence, e.g. how to list the names.
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
+        self._given = kind, name, [*known], hint
+        message = f"unknown {kind} {name!r}{suggest(name, self._given[2])}"
+        super().__init__(f"{message} {hint}" if hint else message)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the arguments instead of the message, so that it can leave a worker process."""
+        return type(self), self._given, self.__dict__
+
+
+class MissingExtraError(AcwmError):
+    """An optional dependency is not installed; the message names the extra to install."""
+
+
+class PluginError(AcwmError):
+    """A plugin breaks its contract: a name already taken, a missing target, a wrong result."""
+
+
+class ShapeError(AcwmError, ValueError):
+    """An array or tensor has the wrong shape, dtype or range."""
+
+
+class ActionError(AcwmError, ValueError):
+    """An action has the wrong shape, is out of its bounds or not finite."""
+
+
+class DataError(AcwmError):
+    """A dataset is missing, damaged, or not the requested one."""
+
+
+class OtherDatasetError(DataError):
+    """The folder to write a dataset to already holds a different one.
+
+    Args:
+        folder: the folder.
+        differences: how the datasets differ, as phrases.
+
+    Attributes:
+        found: the message without its advice, for callers that give their own.
+    """
+
+    def __init__(self, folder: Path, differences: Iterable[str]) -> None:
+        self.found = f"{folder} holds another dataset: {'; '.join(differences)}"
+        super().__init__(
+            f"{self.found}. Choose another --out, or delete the folder to create it again"
+        )
+
+
+class DamagedShardError(DataError):
+    """The bytes of a shard are damaged; the message names the file."""
+
+
+class TrainingError(AcwmError):
+    """Training cannot start or go on: NaN loss, a run folder in use, nothing to resume."""
+
+
+class CheckpointError(AcwmError):
+    """A checkpoint of another program does not contain what a model needs."""
+
+
+class AcwmWarning(UserWarning):
+    """A warning for users; commands show it as one sentence, without a file and line."""
+
+
+class Note(str):
+    """A note on an error that says where it arose. Other libraries add notes of their own."""
+
+
+@contextlib.contextmanager
+def noting(where: str, *components: object) -> Generator[None]:
+    """Add a note to every error that passes, e.g. ``"in episode 3 of train (mine.py:12)"``.
+
+    Args:
+        where: a phrase that begins with a preposition.
+        *components: components that run in the block, or modules by name. The note names the last
+            line in one of their packages.
+    """
+    try:
+        yield
+    except Exception as error:
+        error.add_note(Note(where + _line(error, {_package(each) for each in components})))
+        raise
+
+
+def _package(component: object) -> str:
+    """The top-level package of a module, or of the class or instance of a component."""
+    module = component if isinstance(component, str) else component.__module__
+    return module.partition(":")[0].partition(".")[0]
+
+
+def _line(error: BaseException, packages: set[str]) -> str:
+    """``" (file:line)"`` of the last line of the traceback in one of `packages`, if there is one.
+
+    Empty if the error has another note with a line already: that is nearer to its cause.
+    """
+    if any(note.endswith(")") for note in notes(error)):
+        return ""
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+        if _package(str(frame.f_globals.get("__name__"))) in packages:
+            path, here = Path(frame.f_code.co_filename), Path.cwd()
+            return f" ({path.relative_to(here) if path.is_relative_to(here) else path}:{line})"
+    return ""
+
+
+def notes(error: BaseException) -> list[Note]:
+    """The notes that `noting` added to an error, also in another process."""
+    return [note for note in getattr(error, "__notes__", ()) if isinstance(note, Note)]
+
+
+def sentence(error: BaseException) -> str:
+    """An error in one line: ``"ValueError: message, in episode 3 of train (mine.py:12)"``.
+
+    The type is left out for an `AcwmError`, whose message is made for users.
+    """
+    message = " ".join(str(error).split())
+    if not isinstance(error, AcwmError):
+        message = f"{type(error).__name__}: {message}".removesuffix(": ")
+    return ", ".join([message, *notes(error)])
+
+
+def check_shape(component: object, method: str, made: Any, *shape: int) -> None:
+    """Refuse what a method of a component returned unless it has this shape.
+
+    A wrong shape might be broadcast, and give a wrong result instead of an error.
+
+    Args:
+        component: the component, which the message names.
+        method: the method, for the message.
+        made: what it returned: an array or a tensor.
+        *shape: the shape it must have; -1 stands for any length.
+
+    Raises:
+        PluginError: it has another shape, or none.
+    """
+    found: Any = getattr(made, "shape", None)
+    if (
+        found is None
+        or len(found) != len(shape)
+        or any(wanted not in (-1, length) for length, wanted in zip(found, shape, strict=True))
+    ):
+        gave = f"{made!r:.40}" if found is None else f"the shape {[*found]}"
+        wanted = f"{[*shape]}".replace("-1", "n")
+        owner = f"{type(component).__module__}.{type(component).__qualname__}"
+        raise PluginError(f"{owner}.{method} gives {gave}, not the shape {wanted}")
+
+
+def expect(condition: object, problem: str) -> None:
+    """Raise a `DataError` with the phrase `problem` unless `condition` holds."""
+    if not condition:
+        raise DataError(problem)
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'x'?"`, or at most eight of the known names if none is similar."""
+    import difflib
+
+    names = sorted(known)
+    near = [each for each in names if each.endswith(f".{name}")]  # a task without its environment
+    near = near or difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)  # YAML has numbers
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    if not names:
+        return "; there is none."
+    listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
+    return f"; known: {listed}."
