@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from pkgutil import resolve_name
 from typing import Any, Literal, get_args, get_origin
 
 import click
@@ -10,7 +11,7 @@ from click.shell_completion import CompletionItem
 
 from acwm_core.errors import AcwmError
 from acwm_core.plugins import COMPONENT_KINDS, ComponentKind, catalog
-from acwm_core.recipe.check import SECTIONS, validate
+from acwm_core.recipe.check import LIGHT, check_names
 from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
 from acwm_core.recipe.recipe import flat_items
 from acwm_core.recipe.signature import signature
@@ -73,27 +74,25 @@ def _keys(ctx: click.Context) -> Iterator[tuple[str, str]]:
 
 
 def _values(ctx: click.Context, key: str) -> list[str]:
-    """The possible values of a parameter, if its type lists them."""
+    """The names of components, and the possible values of a parameter if its type lists them."""
     section, _, parameter = key.partition(".")
     kind: Any = "environment" if section == "env" else section
     if section in COMPONENTS and not parameter:
         return [name for name, _ in _named(kind)]
-    target = SECTIONS.get(section)
-    if section in COMPONENTS and (name := _recipe(ctx).get(section, {}).get("name")):
-        target = catalog().component(kind, name).target
-    takes = signature(target) if target else None
-    found = takes.parameters.get(parameter) if takes else None
-    if found is None:
+    if section not in LIGHT:
         return []
-    choices = get_args(found.type) if get_origin(found.type) is Literal else ()
-    return ["true", "false"] if found.type is bool else [str(choice) for choice in choices]
+    takes = signature(resolve_name(LIGHT[section])).parameters
+    found = takes[parameter].type if parameter in takes else None
+    choices = get_args(found) if get_origin(found) is Literal else ()
+    return ["true", "false"] if found is bool else [str(choice) for choice in choices]
 
 
 def _recipe(ctx: click.Context) -> dict[str, Any]:
-    """The recipe on the command line with all defaults; empty if there is none or it is invalid."""
+    """The recipe on the command line, with the defaults that are known without importing torch."""
     name = ctx.params.get("recipe") or ctx.params.get("file")
     try:
-        return validate(read_recipe(name)) if name else {}
+        given = read_recipe(name) if name else {}
+        return {**given, **check_names(given)} if given else {}
     except AcwmError:
         return {}
 

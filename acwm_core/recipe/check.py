@@ -1,4 +1,4 @@
-"""Check names, parameters and types of a composed recipe, without importing the components."""
+"""Check a composed recipe: names and light sections at once, then the components' parameters."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from collections.abc import Collection, Mapping
 from pkgutil import resolve_name
 from typing import Any, cast
 
-from acwm_core.errors import PluginError, RecipeError, suggest
+from acwm_core.env.environment import Environment
+from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import Component, ComponentKind, catalog
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
-from acwm_core.recipe.metrics import library_signature, metric_configs
-from acwm_core.recipe.signature import Signature, signature
+from acwm_core.recipe.metrics import MetricConfig, class_of_library, metric_configs
+from acwm_core.recipe.signature import REQUIRED, Signature, signature
 
-SECTIONS = {
-    "flow": "acwm_core.model.flow:Flow",
+LIGHT = {
     "training": "acwm_core.training.config:TrainingConfig",
     "data": "acwm_core.data.clips:DataConfig",
     "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
-    "trainer": "lightning.pytorch.trainer.trainer:Trainer",
 }
-"""For each section that is not a component, the class that receives its parameters."""
+"""The classes of sections that are checked without importing torch."""
 
-_LIGHT = ("training", "data", "evaluation")
-"""Sections whose classes import nothing heavy, so they are constructed to check their values."""
+SECTIONS = {"flow": "acwm_core.model.flow:Flow", **LIGHT}
+"""For each section that is neither a component nor `trainer`, the class that gets its values."""
 
 FITTED = {
     "model": ("latent_channels",),
@@ -36,7 +35,8 @@ FITTED = {
 def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Check a composed recipe and write out every default.
 
-    Lightning's own defaults for `trainer` are not written out, as some depend on the machine.
+    Flags of `trainer` keep their values: Lightning's defaults depend on the machine, and their
+    types are checked when training starts.
 
     Returns:
         The parameters of each section, converted to the types of their constructors. Components
@@ -46,62 +46,66 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         RecipeError: an unknown section, component or parameter, a wrong type, or something missing.
         PluginError: a registered target does not exist.
     """
-    sections = (*COMPONENTS, *SECTIONS)
-    for name in recipe:
-        if name not in sections:
-            raise RecipeError(
-                f"unknown section {name!r}{_parameter(name) or suggest(name, sections)}"
-            )
-    checked = {
-        section: check_component(section, recipe.get(section))
-        for section in COMPONENTS
-        if section != "env" or recipe.get(section)  # env is optional: datasets know theirs
-    }
-    for section, target in SECTIONS.items():
-        values = _mapping(section, recipe.get(section) or {})
-        takes = signature(target)
-        assert takes is not None
-        checked[section] = _check(section, takes, values, expand=section != "trainer")
-        if section in _LIGHT:  # check ranges and combinations, which types cannot express
-            resolve_name(target)(**checked[section])
-    resolve_name("acwm_core.training.config:chosen_loggers")(checked["trainer"])
-    _check_metrics(checked["evaluation"])
-    return checked
-
-
-def _parameter(name: str) -> str:
-    """A hint if `name` is a parameter whose section was omitted or is wrong."""
-    takes = {section: signature(target) for section, target in SECTIONS.items()}
-    owners = [section for section, found in takes.items() if found and name in found.parameters]
-    return f"; did you mean {owners[0]}.{name}?" if owners else ""
-
-
-def check_component(section: str, choice: Any) -> dict[str, Any]:
-    """Check the component of a section, its `name` and parameters, as `validate` does.
-
-    Raises:
-        RecipeError: an unknown component or parameter, or a wrong type.
-        PluginError: a registered target does not exist.
-    """
-    params = dict(_mapping(section, choice or {}))
-    name = params.pop("name", None)
-    if not isinstance(name, str):
-        raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
-    kind: ComponentKind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
-    component = catalog().component(kind, name)
-    takes, values = _component_signature(component), {**component.defaults, **params}
-    return {"name": name, **_check(section, takes, values, FITTED.get(section, ()))}
-
-
-def _check_metrics(evaluation: Mapping[str, Any]) -> None:
-    listed = metric_configs(evaluation["metrics"])
-    listed |= metric_configs(evaluation["counterfactual_metrics"])
+    values = check_names(recipe)
+    values["flow"] = _check("flow", signature(resolve_name(SECTIONS["flow"])), values["flow"])
+    listed, evaluation = _metrics(values["evaluation"]), values["evaluation"]
     for name, config in listed.items():
         check_metric_params(f"evaluation.metrics.{name}", config.component, config.params)
     options: Mapping[str, Mapping[str, Any]] = evaluation["metric_options"] or {}
     for name, params in options.items():
         component = listed[name].component if name in listed else name
         check_metric_params(f"evaluation.metric_options.{name}", component, params)
+    return values | {
+        section: check_component(section, recipe[section])
+        for section in COMPONENTS
+        if recipe.get(section)
+    }
+
+
+def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Check all that needs no torch: names of sections, components and flags, light sections.
+
+    Returns:
+        The values of the sections that are not components; the light ones with all defaults.
+
+    Raises:
+        RecipeError: an unknown section, component or flag, a wrong type, or something missing.
+    """
+    plain = (*SECTIONS, "trainer")
+    for name in recipe:
+        if name not in (*COMPONENTS, *plain):
+            near = _with_section(name) or suggest(name, (*COMPONENTS, *plain))
+            raise RecipeError(f"unknown section {name!r}{near}")
+    for section in COMPONENTS:
+        if section != "env" or recipe.get(section):  # env is optional: datasets know theirs
+            _component(section, recipe.get(section))
+    values = {section: dict(_mapping(section, recipe.get(section) or {})) for section in plain}
+    for section, target in LIGHT.items():
+        config = resolve_name(target)
+        values[section] = _check(section, signature(config), values[section])
+        config(**values[section])  # checks ranges and combinations, which types cannot express
+    values["trainer"] = _ordered_flags(values["trainer"])
+    for config in _metrics(values["evaluation"]).values():
+        catalog().component("metric", config.component.partition(".")[0])
+    return values
+
+
+def check_component(section: str, choice: Any) -> dict[str, Any]:
+    """Check the component of a section, its `name` and parameters; imports the component.
+
+    The parameters that all environments have are checked without importing the simulator. Where a
+    component's requirements are not installed, its parameters are not checked.
+
+    Raises:
+        RecipeError: an unknown component or parameter, or a wrong type.
+        PluginError: a registered target does not exist.
+    """
+    component, params = _component(section, choice)
+    values = {**component.defaults, **params}
+    takes = signature(Environment)
+    if section != "env" or values.keys() - takes.parameters:
+        takes = _signature_of(component)
+    return {"name": component.name, **_check(section, takes, values, FITTED.get(section, ()))}
 
 
 def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> dict[str, Any]:
@@ -110,6 +114,7 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
     Args:
         where: where they were given, for the message.
         metric: registered name, or ``LIBRARY.path.Class`` of a registered ``LIBRARY``.
+        params: its parameters; without any, the metric is not imported.
 
     Raises:
         RecipeError: an unknown metric or parameter, or a wrong type.
@@ -117,8 +122,48 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
     """
     registered, dot, _ = metric.partition(".")
     component = catalog().component("metric", registered)
-    takes = library_signature(metric) if dot else _component_signature(component)
+    if dot:
+        takes = signature(class_of_library(metric))
+        # What it passes on to its base class is about processes, not about what is measured.
+        takes = takes._replace(open=takes.open and not takes.parameters)
+    else:
+        takes = _signature_of(component) if params else Signature(registered, {})
     return _check(where, takes, params, expand=False)
+
+
+def _component(section: str, choice: Any) -> tuple[Component, dict[str, Any]]:
+    """The component that a section chooses, and the parameters that it gives."""
+    params = dict(_mapping(section, choice or {}))
+    name = params.pop("name", None)
+    if not isinstance(name, str):
+        raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
+    kind: ComponentKind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
+    return catalog().component(kind, name), params
+
+
+def _signature_of(component: Component) -> Signature:
+    if component.missing_modules():
+        return Signature(component.name, {}, open=True)
+    return signature(component.load())
+
+
+def _metrics(evaluation: Mapping[str, Any]) -> dict[str, MetricConfig]:
+    listed = metric_configs(evaluation["metrics"])
+    return listed | metric_configs(evaluation["counterfactual_metrics"])
+
+
+def _ordered_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the names of the flags of Lightning's Trainer, and of the loggers among them."""
+    known = _trainer_flags()
+    for name, value in flags.items():
+        if name not in known:
+            raise _unknown("trainer", name, value, Signature("Trainer", known))
+    resolve_name("acwm_core.training.config:chosen_loggers")(flags)
+    return {name: flags[name] for name in known if name in flags}
+
+
+def _trainer_flags() -> dict[str, Any]:
+    return dict.fromkeys(resolve_name("acwm_core.training.config:TRAINER_FLAGS"))
 
 
 def _mapping(section: str, values: Any) -> Mapping[str, Any]:
@@ -128,48 +173,50 @@ def _mapping(section: str, values: Any) -> Mapping[str, Any]:
     return cast(Mapping[str, Any], values)
 
 
-def _component_signature(component: Component) -> Signature:
-    found = signature(component.target)
-    if found is None:
-        raise PluginError(
-            f"{component.kind} {component.name!r} of plugin {component.plugin!r} points to "
-            f"{component.target}, which does not exist"
-        )
-    return found
-
-
 def _check(
     section: str,
-    reading: Signature,
+    taken: Signature,
     values: Mapping[str, Any],
     fitted: Collection[str] = (),
     *,
     expand: bool = True,
 ) -> dict[str, Any]:
-    takes = {name: p for name, p in reading.parameters.items() if name not in fitted}
+    """Check the values of a section's parameters; with `expand`, write out the others' defaults."""
+    takes = {name: each for name, each in taken.parameters.items() if name not in fitted}
     for name, value in values.items():
         if name in fitted:
             raise RecipeError(f"{section}.{name} follows from the other components; omit it")
-        if name not in takes and not reading.open:
-            raise RecipeError(
-                f"{section}.{name}={types.show(value)}: {reading.owner} has no parameter {name!r}"
-                f"{_parameter(name) or suggest(name, takes)}"
-            )
+        if name not in takes and not taken.open:
+            raise _unknown(section, name, value, taken._replace(parameters=takes))
     checked: dict[str, Any] = {}
     for name, parameter in takes.items():
         if name in values:
-            checked[name] = types.checked(f"{section}.{name}", values[name], parameter.type)
-        elif parameter.value is None and expand:
-            raise RecipeError(
-                f"{reading.owner} needs the parameter {name!r}; add {section}.{name}=…"
-            )
+            where = f"{section}.{name}"
+            checked[name] = types.checked(where, values[name], parameter.type)
+        elif expand and parameter.default is REQUIRED:
+            raise RecipeError(f"{taken.owner} needs the parameter {name!r}; add {section}.{name}=…")
         elif expand and _is_plain(parameter.default):
             checked[name] = parameter.default
     return checked | {name: value for name, value in values.items() if name not in takes}
 
 
+def _unknown(section: str, name: str, value: Any, taken: Signature) -> RecipeError:
+    near = _with_section(name) or suggest(name, taken.parameters)
+    given = f"{section}.{name}={types.show(value)}"
+    return RecipeError(f"{given}: {taken.owner} has no parameter {name!r}{near}")
+
+
+def _with_section(name: str) -> str:
+    """A hint if `name` is a parameter of a light section or of Lightning's Trainer."""
+    known = {
+        section: signature(resolve_name(target)).parameters for section, target in LIGHT.items()
+    }
+    owners = [s for s, names in {**known, "trainer": _trainer_flags()}.items() if name in names]
+    return f"; did you mean {owners[0]}.{name}?" if owners else ""
+
+
 def _is_plain(value: Any) -> bool:
-    """Whether a default can be written to a file; not `...`, which means it could not be read."""
+    """Whether a default can be written to a file."""
     try:
         json.dumps(value)
     except TypeError:

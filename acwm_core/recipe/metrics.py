@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import catalog
-from acwm_core.recipe.signature import Signature, load, signature
 
 MetricChoice = str | Mapping[str, Any]
 """A registered name, or the dotted name of a class whose library is a registered name. Or a mapping
@@ -85,17 +86,15 @@ def own_name(component: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower() if dot else component
 
 
-def library_signature(component: str) -> Signature:
-    """The constructor parameters of ``LIBRARY.path.Class``, read without importing it.
+def class_of_library(component: str) -> Any:
+    """Import the class ``LIBRARY.path.Class``.
 
     Raises:
-        RecipeError: there is no such class.
+        RecipeError: there is no such class; suggests a similar one.
     """
     module, _, name = component.rpartition(".")
-    takes = signature(f"{module}:{name}")
-    if takes is None:
-        source = load(module)
-        known = [each for each in (source.imports if source else ()) if each[:1].isupper()]
-        raise RecipeError(f"there is no {component}{suggest(name, known)}")
-    # What it passes on to its base class is about processes, not about what is measured.
-    return replace(takes, open=not takes.parameters and takes.open)
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError):
+        known = [each for each in dir(sys.modules.get(module)) if each[:1].isupper()]
+        raise RecipeError(f"there is no {component}{suggest(name, known)}") from None

@@ -1,18 +1,18 @@
-"""The pages of all components and of all keys of a recipe, from constructors and their docstrings.
+"""The pages of all components and of all keys of a recipe: constructors and their docstrings."""
 
-Nothing is imported for it: constructors are read as the check of a recipe reads them.
-"""
-
-import ast
+import inspect
+import json
 import re
 from collections.abc import Collection, Iterator, Mapping
-from typing import Any, cast
+from pkgutil import resolve_name
+from typing import Any
 
 from tables import cell, code, table
 
 from acwm_core.plugins import COMPONENT_KINDS, Component, catalog
 from acwm_core.recipe.check import FITTED, SECTIONS
-from acwm_core.recipe.signature import ModuleSource, Parameter, load, signature
+from acwm_core.recipe.signature import REQUIRED, Parameter, signature
+from acwm_core.recipe.types import describe
 
 IN_RECIPES = {
     "environment": "env",
@@ -60,8 +60,10 @@ def recipe_keys_page() -> str:
             f"## {section}\n\n`{section}: NAME`, or a mapping with `name` and parameters. {names}: "
             f"see [their parameters](components.md#{kind}s)."
         )
-    for section, target in SECTIONS.items():
-        summary = _WORDS.get(section) or cell(_docstring(target).partition("\n\n")[0])
+    targets = {**SECTIONS, "trainer": "lightning.pytorch.trainer.trainer:Trainer"}
+    for section, name in targets.items():
+        target = resolve_name(name)
+        summary = _WORDS.get(section) or cell((inspect.getdoc(target) or "").partition("\n\n")[0])
         summary = re.sub(r"^The recipe's section `\w+`: (.)", lambda m: m[1].upper(), summary)
         rows = _parameters(target, {}, (), f"{section}.")
         parts.append(f"## {section}\n\n{summary}\n\n{table(('Key', *_COLUMNS), rows)}")
@@ -78,7 +80,7 @@ def _component(component: Component) -> list[str]:
     anchor = f"{component.kind}-{component.name}"
     fitted = {"environment": _EVERY_WORLD, **FITTED}.get(component.kind, ())
     takes = component.kind not in ("table", "trained_model", "protocol")
-    rows = _parameters(component.target, component.defaults, fitted) if takes else ()
+    rows = _parameters(component.load(), component.defaults, fitted) if takes else ()
     return [
         f"### {component.name} {{: #{anchor} }}",
         " ".join(facts),
@@ -87,81 +89,34 @@ def _component(component: Component) -> list[str]:
 
 
 def _parameters(
-    target: str, preset: Mapping[str, Any], fitted: Collection[str], before: str = ""
+    target: Any, preset: Mapping[str, Any], fitted: Collection[str], before: str = ""
 ) -> Iterator[tuple[str, str, str, str]]:
-    takes = signature(target)
     texts = _descriptions(target)
-    for name, parameter in (takes.parameters if takes else {}).items():
-        if name in fitted:
-            continue
-        shown = code(before + name), code(_type(parameter)), code(_default(parameter, name, preset))
-        yield *shown, cell(texts.get(name, ""))
-
-
-def _type(parameter: Parameter) -> str:
-    """The annotation as written; aliases of a Literal are replaced by their values."""
-    node = parameter.annotation
-    found = parameter.source.find(node.id) if isinstance(node, ast.Name) else None
-    if found and isinstance(found[1], ast.Assign):
-        node = found[1].value
-    if isinstance(node, ast.Constant) and isinstance(node.value, str):  # quoted in the source
-        node = ast.parse(node.value, mode="eval").body
-    return _words(node) if node else ""
-
-
-def _words(node: ast.expr) -> str:
-    """A type as error messages show it: `'velocity' or 'clean'`, `int or null`."""
-    if isinstance(node, ast.BinOp):
-        return f"{_words(node.left)} or {_words(node.right)}"
-    if isinstance(node, ast.Constant) and node.value is None:
-        return "null"
-    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
-        choices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        return " or ".join(map(ast.unparse, choices))
-    return ast.unparse(node)
+    for name, parameter in signature(target).parameters.items():
+        if name not in fitted:
+            kind = "" if parameter.type is Any else describe(parameter.type)
+            default = code(_default(parameter, name, preset))
+            yield code(before + name), code(kind), default, cell(texts.get(name, ""))
 
 
 def _default(parameter: Parameter, name: str, preset: Mapping[str, Any]) -> str:
-    if name in preset:
-        return repr(preset[name])
-    if parameter.value is None:
+    default = preset.get(name, parameter.default)
+    if default is REQUIRED:
         return "required"
-    return ast.unparse(parameter.value) if parameter.default is ... else repr(parameter.default)
+    try:
+        json.dumps(default)
+    except TypeError:
+        return ""  # a factory's, or an object
+    return repr(default)
 
 
-def _descriptions(target: str) -> dict[str, str]:
+def _descriptions(target: Any) -> dict[str, str]:
     """Descriptions of parameters in the docstrings of a class, its constructor and its bases."""
     found: dict[str, str] = {}
-    for node, _ in reversed(list(_classes(target))):
-        own = [item for item in node.body if isinstance(item, ast.FunctionDef)]
-        texts = [ast.get_docstring(each) or "" for each in own if each.name == "__init__"]
-        for text in (ast.get_docstring(node) or "", *texts):
-            for _, names, description in _ENTRY.findall(text):
+    for each in reversed(target.__mro__[:-1] if isinstance(target, type) else (target,)):
+        constructor = vars(each).get("__init__")
+        for text in (each.__doc__, constructor and constructor.__doc__):
+            for _, names, description in _ENTRY.findall(inspect.cleandoc(text or "")):
                 first = re.split(r"\n\s*\n|(?<=\.)\s+(?=::|\.\. )", description)[0]
                 found |= {name.strip(): first for name in names.split(",")}
     return found
-
-
-def _docstring(target: str) -> str:
-    return ast.get_docstring(next(_classes(target))[0]) or ""
-
-
-def _classes(target: str) -> Iterator[tuple[ast.ClassDef, ModuleSource]]:
-    """A class and its bases, in the order of the source; a function has no bases."""
-    module, _, name = target.partition(":")
-    source = load(module)
-    found = source.find(name) if source else None
-    if found is None:
-        return
-    source, node = found
-    if isinstance(node, ast.FunctionDef):
-        node = ast.ClassDef(name, [], [], node.body, [])
-    if not isinstance(node, ast.ClassDef):
-        return
-    yield cast(ast.ClassDef, node), source
-    for base in node.bases:
-        above, _, parent = source.dotted(base).rpartition(".")
-        if above:
-            yield from _classes(f"{above}:{parent}")
-        elif parent in source.definitions:
-            yield from _classes(f"{module}:{parent}")

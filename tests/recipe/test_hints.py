@@ -12,7 +12,11 @@ from tests.plugins import plugin_of
 
 @pytest.mark.parametrize(
     ("override", "wanted"),
-    [("seed=3", "training.seed"), ("max_steps=9", "trainer.max_steps"), ("shift=2", "flow.shift")],
+    [
+        ("seed=3", "training.seed"),
+        ("max_steps=9", "trainer.max_steps"),
+        ("batch_size=2", "data.batch_size"),
+    ],
 )
 def test_a_parameter_without_its_section_is_told_it(override, wanted):
     with pytest.raises(RecipeError, match=f"unknown section .*; did you mean {wanted}?"):

@@ -10,10 +10,14 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PLUGINS = {path.parent.name for path in (ROOT / "plugins").glob("*/__init__.py")}
 HEAVY = ("torch", "lightning", "taichi", "mujoco", "pandas", "matplotlib", "pyarrow")
-PLANS = [
-    "show push_cube_small model=dit_s model.layers=4 trainer.precision=16-mixed codec=identity",
-    "experiment ablations/conditioning_small --plan",
-    "experiment planning --plan",
+MISSPELT = [
+    "show push_cube_smal",
+    "show push_cube_small modle=dit_s",
+    "show push_cube_small model=dit_z",
+    "show push_cube_small training.learning_rat=1",
+    "show push_cube_small data.batch_size=x",
+    "show push_cube_small evaluation.metrics=[psrn]",
+    "show push_cube_small trainer.max_step=1",
 ]
 MODULES = ["recipe", "plugins", "env.environment", "env.episode", "env.task", "training.config"]
 
@@ -43,14 +47,23 @@ def imported_by(code, *more):
     return done.stdout.rpartition("heavy:")[2].split()
 
 
-@pytest.mark.parametrize("words", ["--help", "list", "fit --help", "generate --help", *PLANS])
-def test_these_commands_import_nothing_heavy(words):
-    code = (
+def imported_by_command(words, exit_code, *more):
+    return imported_by(
         "from acwm_core.cli import main\n"
         f"try: main({words.split()!r})\n"
-        "except SystemExit as end: assert not end.code, end.code"
+        f"except SystemExit as end: assert (end.code or 0) == {exit_code}, end.code",
+        *more,
     )
-    assert imported_by(code, *([] if words in PLANS else ["numpy"])) == []
+
+
+@pytest.mark.parametrize("words", ["--help", "list", "fit --help", "generate --help"])
+def test_these_commands_import_nothing_heavy(words):
+    assert imported_by_command(words, 0, "numpy") == []
+
+
+@pytest.mark.parametrize("words", MISSPELT)
+def test_a_wrong_name_or_light_value_is_told_without_heavy_imports(words):
+    assert imported_by_command(words, 2) == []
 
 
 @pytest.mark.parametrize("module", MODULES)
