@@ -143,6 +143,11 @@ def notes(error: BaseException) -> list[Note]:
     return [note for note in getattr(error, "__notes__", ()) if isinstance(note, Note)]
 
 
+def is_for_users(error: BaseException) -> bool:
+    """Whether to show an error as a sentence: it is made for users, or arose in a component."""
+    return isinstance(error, AcwmError) or bool(notes(error))
+
+
 def sentence(error: BaseException) -> str:
     """An error in one line: ``"ValueError: message, in episode 3 of train (mine.py:12)"``.
 

@@ -14,30 +14,19 @@ the plugins; one that fails is left out and reported, and the others work.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 import importlib.metadata
 import importlib.util
 import re
-import signal
 import sys
-import threading
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, cast, get_args
 
 import pluggy
 
-from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError
-from acwm_core.plugin_code import (
-    blaming,
-    explained,
-    importing,
-    is_by_an_author,
-    mark,
-    package_of,
-)
+from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, noting, sentence
 
 Made = TypeVar("Made")
 
@@ -110,7 +99,7 @@ class Component:
 
         Raises:
             MissingExtraError: a module outside the plugin's own package is not installed.
-            PluginError: there is no such module or attribute, or the module raises.
+            PluginError: the module has no such attribute.
         """
         return self._imported(self.target)
 
@@ -133,26 +122,20 @@ class Component:
         """
         if name not in self.tasks:
             raise UnknownNameError(f"{self.name} task", name, self.tasks)
-        found = self._imported(self.tasks[name])
-        mark(found, f"task {name!r} of {self.part}")
-        return found
+        return self._imported(self.tasks[name])
 
     def _imported(self, target: str) -> Any:
         module_name, _, attribute = target.partition(":")
         part = f"{self.part} of plugin {self.plugin!r}"
-        is_by_an_author(module_name)
-        with (
-            importing(f"{self.part} ({module_name})"),
-            blaming("", part, doing="cannot be imported"),
-        ):
-            try:
+        try:
+            with noting(f"in {part}", module_name):
                 module = importlib.import_module(module_name)
-            except ModuleNotFoundError as error:
-                missing = package_of(error.name)
-                if missing == package_of(module_name):
-                    raise  # a module of the plugin itself: no extra has it
-                needs = f"{self.part} needs {missing!r}"
-                raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
+        except ModuleNotFoundError as error:
+            missing = str(error.name).partition(".")[0]
+            if missing == module_name.partition(".")[0]:
+                raise  # a module of the plugin itself: no extra has it
+            needs = f"{self.part} needs {missing!r}"
+            raise MissingExtraError(f"{needs}: {self.install_command(missing)}") from error
         try:
             return getattr(module, attribute)
         except AttributeError as error:
@@ -161,17 +144,10 @@ class Component:
             ) from error
 
     def create(self, **params: Any) -> Any:
-        """Import and construct the component; `params` override the preset `defaults`.
-
-        Raises:
-            PluginError: it cannot be constructed, e.g. because an abstract method is missing.
-        """
+        """Import and construct the component; `params` override the preset `defaults`."""
         target = self.load()
-        with blaming(part=self.part, of=target, doing="cannot be made"):
-            made = target(**{**self.defaults, **params})
-        if self.kind != "executor":  # it runs others' code
-            mark(made, self.part)
-        return made
+        with noting(f"in {self.part} of plugin {self.plugin!r}", target):
+            return target(**{**self.defaults, **params})
 
     def create_as(self, base: type[Made], **params: Any) -> Made:
         """Construct the component; `PluginError` if the result is not a `base`."""
@@ -512,19 +488,13 @@ class Catalog:
 
     def load_entry_points(self) -> None:
         """Load every plugin of the entry-point group, in order of name, each independently."""
-        with _noting_ctrl_c() as pressed:
-            for entry_point in self._entry_points():
-                is_by_an_author(entry_point.value)
-                try:
-                    distribution = entry_point.dist.name if entry_point.dist else None
-                    with importing(f"plugin {entry_point.name!r} ({entry_point.value})"):
-                        plugin = entry_point.load()
-                        self.add_plugin(plugin, entry_point.name, distribution)
-                except BaseException as error:  # a module may even call sys.exit
-                    if pressed:
-                        raise
-                    reason = " ".join(explained(error).split())
-                    self.problems.append(Problem(entry_point.name, reason))
+        for entry_point in self._entry_points():
+            try:
+                distribution = entry_point.dist.name if entry_point.dist else None
+                with noting(f"in {entry_point.value}", entry_point.value):
+                    self.add_plugin(entry_point.load(), entry_point.name, distribution)
+            except (Exception, SystemExit) as error:  # a module may even call sys.exit
+                self.problems.append(Problem(entry_point.name, sentence(error)))
 
     def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
         """The entry points of all distributions; those with a damaged file become problems."""
@@ -535,23 +505,8 @@ class Catalog:
                     found.setdefault((point.name, point.value), point)
             except Exception as error:  # possibly of an unrelated package
                 where = str(getattr(distribution, "_path", distribution))
-                self.problems.append(Problem(where, explained(error)))
+                self.problems.append(Problem(where, sentence(error)))
         return [found[key] for key in sorted(found)]
-
-
-@contextlib.contextmanager
-def _noting_ctrl_c() -> Generator[list[int]]:
-    """Yield a list that gets an entry on Ctrl-C. A plugin may also raise `KeyboardInterrupt`."""
-    pressed: list[int] = []
-    usual: Any = signal.getsignal(signal.SIGINT)
-    heeded = callable(usual) and threading.current_thread() is threading.main_thread()
-    if heeded:
-        signal.signal(signal.SIGINT, lambda n, frame: (pressed.append(n), usual(n, frame)))
-    try:
-        yield pressed
-    finally:
-        if heeded:
-            signal.signal(signal.SIGINT, usual)
 
 
 @functools.cache

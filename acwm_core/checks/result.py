@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from acwm_core.errors import PluginError
-from acwm_core.plugin_code import explained, is_by_an_author, is_true_stop
+from acwm_core.errors import noting, sentence
 from acwm_core.plugins import ComponentKind, catalog
 
 Checked = str | Callable[..., Any]
@@ -68,12 +67,12 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
     for index, check in enumerate(checks_of(type(suite))):
         name = check.__name__.replace("_", " ")
         try:
-            check(suite)
-        except BaseException as error:  # a component that exits the program fails, too
-            if is_true_stop(error):
-                raise
-            told = isinstance(error, (CheckFailure, PluginError))
-            yield CheckResult(name, False, str(error) if told else explained(error, suite.target))
+            with noting(f"in {suite.target.__name__}", suite.target):
+                check(suite)
+        except CheckFailure as error:
+            yield CheckResult(name, False, str(error))
+        except (Exception, SystemExit) as error:
+            yield CheckResult(name, False, sentence(error))
             if index == 0:
                 return
         else:
@@ -89,7 +88,6 @@ class Suite:
         self.name = component if isinstance(component, str) else None
         registered = self.name and catalog().component(self.kind, self.name)
         self.target: Any = registered.load() if registered else component
-        is_by_an_author(self.target.__module__)
         create: Any = registered.create if registered else component
         self.make = functools.partial(create, **params)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from acwm_core.cli.arguments import split_parameters
-from acwm_core.errors import AcwmError, RecipeError, UnknownNameError
+from acwm_core.errors import RecipeError, UnknownNameError, sentence
 from acwm_core.plugins import COMPONENT_KINDS, Component, ComponentKind
 
 if TYPE_CHECKING:
@@ -136,8 +136,8 @@ def _summary(component: Component) -> str:
         return component.summary
     try:
         return str(component.load().summary)
-    except (AcwmError, AttributeError) as error:
-        return f"({error})"
+    except Exception as error:  # whatever a plugin raises as it is imported
+        return f"({sentence(error)})"
 
 
 def _parameters_of_suites(

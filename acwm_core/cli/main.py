@@ -19,9 +19,8 @@ from acwm_core.cli.doctor import doctor
 from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
-from acwm_core.errors import AcwmError, AcwmWarning, PluginError, suggest
+from acwm_core.errors import AcwmError, AcwmWarning, is_for_users, sentence, suggest
 from acwm_core.interrupts import INTERRUPTED
-from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from acwm_core.renamed import RenamedWarning
 from acwm_core.untrusted import printable
@@ -30,8 +29,9 @@ from acwm_core.untrusted import printable
 class AcwmGroup(click.Group):
     """A command group that reports errors a user can fix in one sentence on stderr.
 
-    The exit code is 2 for a wrong override, name or file, and 130 after Ctrl-C. Errors of plugins
-    are reported in one sentence, too. Any other error is a bug in acwm and keeps its traceback.
+    The exit code is 2 for a wrong override, name or file, and 130 after Ctrl-C. Errors with a note
+    that names a component are reported in one sentence, too. Any other error is a bug in acwm and
+    keeps its traceback.
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -69,11 +69,6 @@ class AcwmGroup(click.Group):
             return super().resolve_command(ctx, args)
         raise click.UsageError(f"there is no command {args[0]!r}{suggest(args[0], names)}", ctx)
 
-    def invoke(self, ctx: click.Context) -> Any:
-        """Turn errors of plugins into `PluginError` before click handles them as its own."""
-        with blaming(leaving=disk_error):
-            return super().invoke(ctx)
-
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
         warnings.simplefilter("always", RenamedWarning)
@@ -83,8 +78,7 @@ class AcwmGroup(click.Group):
         shown = "--traceback" in words
         words = [word for word in words if word != "--traceback"]  # at any position
         try:
-            with blaming(leaving=disk_error):
-                result = super().main(words, *more, **{**extra, "standalone_mode": False})
+            result = super().main(words, *more, **{**extra, "standalone_mode": False})
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
             sys.exit(error.exit_code)
@@ -93,25 +87,30 @@ class AcwmGroup(click.Group):
             _fail(f"{error.format_message().rstrip('.')} (see {where} --help)", error.exit_code)
         except click.ClickException as error:
             _fail(error.format_message(), error.exit_code)
-        except AcwmError as error:
-            if shown:
-                traceback.print_exception(error)
-            _refuse_a_deleted_folder(error.__cause__)
-            hint = isinstance(error, PluginError) and error.__cause__ and not shown
-            _fail(f"{error}{'; --traceback shows all of it' if hint else ''}", error.exit_code)
-        except (KeyboardInterrupt, click.Abort):
+        except (KeyboardInterrupt, click.Abort) as stop:
+            if isinstance(stop.__cause__, EOFError):  # click takes it for the end of the input
+                _report(stop.__cause__, shown)
             _fail("stopped", INTERRUPTED)
         except Exception as error:
-            _refuse_a_deleted_folder(error)
-            if (found := disk_error(error)) is None:
-                raise
-            where = f"{found.filename}: " if found.filename else ""
-            _fail(
-                f"{where}{found.strerror}; free disk space or fix the permissions, and run the "
-                "command again",
-                2,
-            )
+            _report(error, shown)
         sys.exit(result if isinstance(result, int) else 0)
+
+
+def _report(error: Exception, with_traceback: bool) -> NoReturn:
+    """End the command with a sentence about `error`; raises it if it is a bug in acwm."""
+    if with_traceback:
+        traceback.print_exception(error)
+    _refuse_a_deleted_folder(error)
+    found = None if isinstance(error, AcwmError) else disk_error(error)
+    if found is not None:
+        where = f"{found.filename}: " if found.filename else ""
+        advice = "free disk space or fix the permissions, and run the command again"
+        _fail(f"{where}{found.strerror}; {advice}", 2)
+    if isinstance(error, AcwmError):
+        _fail(sentence(error), error.exit_code)
+    if not is_for_users(error):
+        raise error
+    _fail(f"{sentence(error)}{'' if with_traceback else '; --traceback shows all of it'}", 2)
 
 
 def _print_anything() -> None:

@@ -17,10 +17,9 @@ from acwm_core.data.atomic import alone, writing, written_whole
 from acwm_core.data.clips import padded_video
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.latents import LatentFolder
-from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.errors import DamagedShardError, DataError, noting
 from acwm_core.executors import Report, progress_bar
 from acwm_core.model.codec import Codec
-from acwm_core.plugin_code import blaming
 
 
 def encode_windows(
@@ -88,7 +87,7 @@ def _write_shard(
     first, count = folder.episodes.shards[number]
     for index in range(first, first + count):
         try:
-            with blaming(f"in episode {index} of {folder.episodes.split}"):
+            with noting(f"in episode {index} of {folder.episodes.split}", codec):
                 rows.append(_encode_episode(folder, codec, index, batch_size))
         except DamagedShardError:
             if not skip_damaged:

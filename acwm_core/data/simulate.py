@@ -25,9 +25,15 @@ from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
-from acwm_core.errors import ActionError, AcwmError, DataError, PluginError, ShapeError, expect
+from acwm_core.errors import (
+    ActionError,
+    DataError,
+    PluginError,
+    ShapeError,
+    expect,
+    noting,
+)
 from acwm_core.executors import Report
-from acwm_core.plugin_code import blaming
 from acwm_core.plugins import Component, catalog
 
 EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
@@ -103,7 +109,7 @@ def simulate(
         state = {name: np.array(value) for name, value in info["state"].items()}
         infos.append({**info, "state": state, "mask": np.array(info["mask"])})
 
-    with blaming(f"in episode {spec.index} of {spec.split}", environment):
+    with noting(f"in episode {spec.index} of {spec.split} of {card.name}", environment):
         look(*environment.reset(options=options))
         act = environment.policy(spec.rng("policy")) if actions is None else iter(actions).__next__
         for index in range(horizon - 1):
@@ -173,7 +179,7 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
     if record is not None:
         report(record.episodes)
         return task.split, record
-    with writing(task.path), blaming(f"in {task.path.parent.name}/{task.path.name}"):
+    with writing(task.path):
         write_shard(task.path, counted(), task.card.environment.fps, task.card.versions)
     return task.split, ShardRecord.of_file(task.path, task.first)
 
@@ -197,23 +203,15 @@ def simulated(
     were chosen for another start; the first of `specs` never does.
 
     Raises:
-        DataError: an episode could not be simulated, or does not match the environment's card.
-        PluginError: the environment raised something else; the message names the episode.
+        DataError: an episode does not match the environment's card.
     """
     environment = _environment(component, specs[0].options)
     actions: NDArray[np.floating[Any]] | None = None
     for spec in specs:
         explores = spec.split == "train" and spec.rng("exploration").random() < exploration
-        try:
-            episode = simulate(environment, spec, actions if explores else None)
+        episode = simulate(environment, spec, actions if explores else None)
+        with noting(f"in episode {spec.index} of {spec.split} of {environment.card.name}"):
             check_episode(episode, environment.card)
-        except PluginError:
-            raise  # it names the episode already
-        except AcwmError as error:
-            raise DataError(
-                f"episode {spec.index} of {spec.split} of {spec.environment} could not be "
-                f"simulated: {error} (spec {spec})"
-            ) from error
         yield episode
         actions = episode.actions
 

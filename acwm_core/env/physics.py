@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.plugin_code import WrongResultError, numbers
+from acwm_core.errors import PluginError, check_shape
 
 if TYPE_CHECKING:
     from acwm_core.model.shapes import Clip
@@ -240,19 +240,17 @@ class StateEstimator(ABC):
         """
 
     def read(self, video: Clip) -> Observation:
-        """Call `estimate` and check its result; `WrongResultError` if it does not fit the video."""
+        """Call `estimate` and check its result; `PluginError` if it does not fit the video."""
         seen: Any = self.estimate(video)
         frames, _, *size = video.shape
         if not isinstance(seen, Observation) or set(self.fields) - set(seen.states):
-            raise WrongResultError(self, "estimate", seen, f"an Observation of {self.fields}")
-        masks = numbers(self, "estimate (masks)", seen.masks, frames, *size, dtype=np.uint8)
-        states = {**seen.states}
+            owner = type(self).__name__
+            raise PluginError(f"{owner}.estimate gives no Observation of {', '.join(self.fields)}")
+        check_shape(self, "estimate (masks)", seen.masks, frames, *size)
         for field in (each for each in self.card.state if each.name in self.fields):
-            method, shape = f"estimate ({field.name})", (frames, *field.shape)
-            states[field.name] = found = numbers(self, method, states[field.name], *shape)
-            if np.isinf(found).any():
-                raise WrongResultError(self, method, math.inf, "finite numbers, or NaN")
-        return Observation(masks, states)
+            method = f"estimate ({field.name})"
+            check_shape(self, method, seen.states[field.name], frames, *field.shape)
+        return seen
 
     @abstractmethod
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.physics import Observation
-from acwm_core.errors import PluginError, RecipeError
-from acwm_core.plugin_code import WrongResultError, numbers
+from acwm_core.errors import PluginError, RecipeError, check_shape
 
 Frame = NDArray[np.uint8]
 
@@ -108,12 +107,10 @@ def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[An
     """Call `distance`, `failed` or `success` and check its result, one value per frame `[T]`.
 
     Raises:
-        WrongResultError: the result is not one number (or one truth value) per frame.
+        PluginError: the result is not one value per frame.
     """
-    made, dtype = getattr(task, method)(seen, goal), None if method == "distance" else np.bool_
-    found = numbers(task, method, made, len(seen.masks), dtype=dtype)
-    for wrong in found[(found < 0) | np.isinf(found)] if dtype is None else ():
-        raise WrongResultError(task, method, float(wrong), "finite numbers of at least 0")
+    found = np.asarray(getattr(task, method)(seen, goal))
+    check_shape(task, method, found, len(seen.masks))
     return found
 
 
@@ -164,15 +161,9 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         spec = self.environment.episode_spec
         again: dict[str, Any] = {**(options or {}), "spec": spec}
         rng = spec.rng(f"goal:{self.task.name}")
-        self._steps, self._failed, size = 0, False, self.environment.frame_size
+        self._steps, self._failed = 0, False
         for _ in range(MAX_DRAWS):
-            goal: Any = again.get("goal") or self.task.sample_goal(self.environment, rng)
-            if not isinstance(goal, Goal):
-                raise WrongResultError(self.task, "sample_goal", goal, "a Goal")
-            for name, shape in (("frame", (*size, 3)), ("mask", size)):
-                what, picture = f"sample_goal ({name})", getattr(goal, name)
-                numbers(self.task, what, picture, *shape, dtype=np.uint8)
-            self.goal = goal
+            self.goal = again.get("goal") or self.task.sample_goal(self.environment, rng)
             frame, info = self.environment.reset(options=again)
             self.judge(info)
             if not info["success"] or "goal" in again:
@@ -197,5 +188,5 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         success = bool(judged(task, "success", seen, goal)[0]) and not self._failed
         distance = float(judged(task, "distance", seen, goal)[0])
         if distance != distance:  # NaN; but the simulator knows every state, so this is an error
-            raise WrongResultError(task, "distance", distance, "a number in its own states")
+            raise PluginError(f"the distance of task {task.name!r} is NaN in its own states")
         info |= {"distance": distance, "success": success, "failed": self._failed}

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from acwm_core.errors import AcwmError, AcwmWarning
+from acwm_core.errors import AcwmWarning, sentence
 from acwm_core.plugins import catalog
 
 
@@ -75,8 +75,8 @@ def published_tables() -> dict[str, PublishedTable]:
     for each in catalog().registry("table"):
         try:
             found[each.name] = each.create_as(PublishedTable)
-        except AcwmError as error:  # the table may not be needed, so only warn
-            warnings.warn(f"left out: {error}", AcwmWarning, stacklevel=2)
+        except Exception as error:  # the table may not be needed, so only warn
+            warnings.warn(f"left out: {sentence(error)}", AcwmWarning, stacklevel=2)
     return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec
 from acwm_core.env.episode import Episode
+from acwm_core.errors import noting
 from acwm_core.evaluation.clip_results import summary_of
 from acwm_core.evaluation.clips import Batch, ClipPlan, Predictor, as_clip
 from acwm_core.evaluation.evaluator import Evaluator, ShownClip
@@ -19,7 +20,6 @@ from acwm_core.evaluation.results import Counterfactual, ResponseCurve, VideoRec
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
 from acwm_core.evaluation.videos import case_study
 from acwm_core.model.shapes import Clip
-from acwm_core.plugin_code import blaming
 
 ROWS: tuple[Predictor, ...] = ("model", "codec")
 """The rows that are compared: the model, and the codec's reconstruction of the true responses,
@@ -65,7 +65,7 @@ def counterfactual(
     for fan in fans:
         truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
         for row in ROWS:
-            with blaming(fan.plan.where):
+            with noting(fan.plan.where, *evaluator.world_model.children()):
                 rollout = _rollout(evaluator, fan, truth, row)
                 responses.add(row, fan, rollout)
             if row == "model" and not videos:

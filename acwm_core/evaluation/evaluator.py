@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
+from acwm_core.errors import noting
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import PREDICTORS, Batch, ClipPlan, Predictor, batches, load_samples
 from acwm_core.evaluation.config import EvaluationConfig
@@ -32,7 +33,6 @@ from acwm_core.evaluation.videos import case_study
 from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.shapes import Actions, Video
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 
 Results = Mapping[str, list[ClipResult]]
 """Results by split."""
@@ -185,7 +185,7 @@ class Evaluator:
         for group in batches(load_samples(plans, episodes), self.config.batch_size):
             first, last = group[0].plan, group[-1].plan
             until = f" to episode {last.episode}, from frame {last.start}" if last != first else ""
-            with blaming(f"{first.where}{until}"):
+            with noting(f"{first.where}{until}", *self.world_model.children()):
                 made = self.predict(Batch.of(group, self.device), predictors)
             yield [
                 Prediction(sample, each, made[each][place])

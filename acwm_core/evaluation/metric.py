@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import Observation, StateEstimator
-from acwm_core.errors import PluginError, ShapeError
-from acwm_core.plugin_code import WrongResultError, blaming, numbers
+from acwm_core.errors import PluginError, ShapeError, check_shape, noting
 
 if TYPE_CHECKING:
     from acwm_core.model.shapes import Clip
@@ -208,8 +207,10 @@ class Metric(ABC):
         return 1.0
 
     def curve(self, rollout: Rollout) -> NDArray[np.float64]:
-        """Call `per_frame`; `WrongResultError` unless the result has one number per frame."""
-        return numbers(self, "per_frame", self.per_frame(rollout), len(rollout.target))
+        """Call `per_frame`; `PluginError` unless the result has one number per frame."""
+        scores = np.asarray(self.per_frame(rollout), np.float64)
+        check_shape(self, "per_frame", scores, len(rollout.target))
+        return scores
 
     def scored(
         self, rollout: Rollout, curve: NDArray[np.float64] | None = None
@@ -220,23 +221,23 @@ class Metric(ABC):
             curve: the result of `curve` for the clip, if it is known already.
 
         Raises:
-            WrongResultError: they are not numbers, or the weight is negative or not finite.
+            PluginError: the weight is negative or not finite.
         """
         if not rollout.is_finite:
             return self.worst, 1.0
         if type(self).value is Metric.value:
             value = mean_of_defined(self.curve(rollout) if curve is None else curve)
         else:
-            value = float(numbers(self, "value", self.value(rollout)))
-        weight = float(numbers(self, "weight", self.weight(rollout)))
+            value = float(self.value(rollout))
+        weight = float(self.weight(rollout))
         if not 0 <= weight < math.inf:
-            raise WrongResultError(self, "weight", weight, "a finite number of at least 0")
+            raise PluginError(f"{type(self).__name__}.weight gives {weight}, not at least 0")
         return value, weight
 
     def summed_up(self, values: Numbers, weights: Numbers | None = None) -> float:
-        """Call `summarise`; `PluginError` if it raises or its result is not a number."""
-        with blaming("when it sums clips up", self):
-            return float(numbers(self, "summarise", self.summarise(values, weights)))
+        """Call `summarise`; errors get a note that names the metric."""
+        with noting(f"in metric {self.name!r} as it sums clips up", self):
+            return float(self.summarise(values, weights))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """Summarise many clips in one number: the weighted mean of the values unless overridden.
@@ -267,10 +268,9 @@ class SetMetric(Metric):
         """
 
     def distance_of(self, clips: Sequence[object]) -> float:
-        """Call `distance` on the `features` of clips; `PluginError` as in `summed_up`."""
-        with blaming("when it sums clips up", self):
-            features = numbers(self, "features", clips, len(clips), 2, -1).astype(np.float32)
-            return float(numbers(self, "distance", self.distance(features)))
+        """Call `distance` on the `features` of clips; errors get a note as in `summed_up`."""
+        with noting(f"in metric {self.name!r} as it sums clips up", self):
+            return float(self.distance(np.asarray(clips, np.float32)))
 
     def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
         """All NaN, `[T]`: single frames have no score."""

@@ -8,15 +8,15 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.errors import PluginError, RecipeError, ShapeError
+from acwm_core.errors import PluginError, RecipeError, ShapeError, check_shape, noting
 from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
 from acwm_core.evaluation.metric import Metric, Rollout, SetMetric
 from acwm_core.model.shapes import Clip
-from acwm_core.plugin_code import WrongResultError, blaming, numbers
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 
@@ -86,19 +86,11 @@ def measure_facts(
     metrics: Mapping[str, Metric], estimator: StateEstimator | None
 ) -> dict[str, Any]:
     """What scores depend on besides the videos: ``metrics`` and ``estimator`` of `provenance`."""
-    facts = {name: _provenance(metric) for name, metric in metrics.items()}
+    facts = {name: dict(metric.provenance()) for name, metric in metrics.items()}
     return {
         "metrics": {name: each for name, each in facts.items() if each},
-        "estimator": _provenance(estimator) if estimator else None,
+        "estimator": dict(estimator.provenance()) if estimator else None,
     }
-
-
-def _provenance(part: Metric | StateEstimator) -> dict[str, str]:
-    with blaming(part=part):
-        found: dict[Any, Any] = {**part.provenance()}
-        if not all(isinstance(each, str) for pair in found.items() for each in pair):
-            raise WrongResultError(part, "provenance", found, "text by names")
-        return found
 
 
 def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
@@ -164,14 +156,19 @@ def score(
     rollout = Rollout.of(*scored, card, estimator)
     if not rollout.is_finite:
         return _failed(prediction, rollout, measured, metrics)
-    with blaming(sample.plan.where), torch.autocast("cpu", enabled=False):
-        curves = {name: metric.curve(rollout) for name, metric in measured.items()}
-        scores = {name: m.scored(rollout, curves[name]) for name, m in measured.items()}
-        sets = {
-            name: numbers(metric, "features", metric.features(rollout), 2, -1)
-            for name, metric in measured.items()
-            if isinstance(metric, SetMetric)
-        }
+    curves, scores, sets = (
+        dict[str, NDArray[np.float64]](),
+        dict[str, tuple[float, float]](),
+        dict[str, Any](),
+    )
+    with torch.autocast("cpu", enabled=False):
+        for name, metric in measured.items():
+            with noting(f"in metric {name!r} {sample.plan.where}", metric):
+                curves[name] = metric.curve(rollout)
+                scores[name] = metric.scored(rollout, curves[name])
+                if isinstance(metric, SetMetric):
+                    sets[name] = np.asarray(metric.features(rollout))
+                    check_shape(metric, "features", sets[name], 2, -1)
     values, weights = ({n: s[place] for n, s in scores.items()} for place in (0, 1))
     undefined = [name for name in metrics if name not in measured]
     curves |= dict.fromkeys(undefined, np.full(len(rollout.target), np.nan))

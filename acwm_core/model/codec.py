@@ -8,9 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError, check_shape
 from acwm_core.model.shapes import Latent, Video
-from acwm_core.plugin_code import shaped
 
 FrameDecoder = Callable[[Latent], Video]
 """Maps the next latent frames `[B, k, C, h, w]` to their video frames."""
@@ -68,7 +67,8 @@ class Codec(nn.Module, ABC):
             video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
         length, size = self.latent_frames(frames), self.latent_size(*video.shape[3:])
         made = self._encode(video)
-        return shaped(self, "_encode", made, len(video), length, self.channels, *size).float()
+        check_shape(self, "_encode", made, len(video), length, self.channels, *size)
+        return made.float()
 
     def decode(self, latents: Latent, frames: int | None = None) -> Video:
         """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.
@@ -83,7 +83,8 @@ class Codec(nn.Module, ABC):
                 f"{latents.shape[1]} latent frames decode to {decodable} frames, not {frames}"
             )
         sides = [side * self.spatial_stride for side in latents.shape[3:]]
-        video = shaped(self, "_decode", self._decode(latents), len(latents), decodable, 3, *sides)
+        video = self._decode(latents)
+        check_shape(self, "_decode", video, len(latents), decodable, 3, *sides)
         return video[:, :frames].float().clamp(0, 1)
 
     def latent_frames(self, frames: int) -> int:

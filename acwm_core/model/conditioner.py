@@ -14,8 +14,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from acwm_core.errors import PluginError, check_shape
 from acwm_core.model.shapes import Actions, Latent, Modulation, Sigmas, Tokens
-from acwm_core.plugin_code import WrongResultError, shaped
 
 
 @dataclass(frozen=True)
@@ -98,15 +98,15 @@ class Conditioner(nn.Module, ABC):
         """Call `forward`, and check its result for `frames` latent frames and model width `width`.
 
         Raises:
-            WrongResultError: the result has the wrong type or shape.
+            PluginError: the result has the wrong type or shape.
         """
         made: object = self(actions)
         if not isinstance(made, Conditioning):
-            raise WrongResultError(self, "forward", made, "a Conditioning")
+            raise PluginError(f"{type(self).__name__}.forward gives {made!r:.40}, no Conditioning")
         if made.modulation is not None:
-            shaped(self, "modulation", made.modulation, len(actions), frames, width)
+            check_shape(self, "modulation", made.modulation, len(actions), frames, width)
         if made.context is not None:
-            shaped(self, "context", made.context, len(actions), frames, -1, width)
+            check_shape(self, "context", made.context, len(actions), frames, -1, width)
         return made
 
     def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:

@@ -15,7 +15,6 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, DynamicsModel, LatentStream
 from acwm_core.model.flow import Flow, drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
-from acwm_core.plugin_code import shaped
 
 
 class Denoiser(DynamicsModel):
@@ -65,14 +64,11 @@ class Denoiser(DynamicsModel):
         if self.flow.objective == "next_frame":
             return next_frame.loss(self, latents, conditioning, generators)
         return self.flow.loss(
-            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning),
+            lambda noisy, sigma: self(noisy, sigma, conditioning),
             latents,
             generators,
             self.given_frames,
         )
-
-    def _evaluated(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
-        return shaped(self, "forward", self(latents, sigma, conditioning), *latents.shape)
 
     def predict(
         self,
@@ -90,7 +86,7 @@ class Denoiser(DynamicsModel):
             return next_frame.predict(self, given, conditioning, frames, generators, steps)
         noise = drawn_noise((frames, *given.shape[2:]), generators).to(given)
         return self.flow.sample(
-            lambda noisy, sigma: self._evaluated(noisy, sigma, conditioning), noise, given, steps
+            lambda noisy, sigma: self(noisy, sigma, conditioning), noise, given, steps
         )
 
     def stream(
@@ -180,12 +176,10 @@ class _DenoisedStream(LatentStream):
 
         def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
             if self._unkept is None:
-                made = self._model.extend(noisy, sigma, alone, self._cache)
-                return shaped(self._model, "extend", made, *noisy.shape)
+                return self._model.extend(noisy, sigma, alone, self._cache)
             pair = torch.cat([self._unkept, noisy], 1)
             level = functional.pad(sigma, (done, 0))
-            made = self._model.extend(pair, level, conditioning, self._cache)
-            predicted = shaped(self._model, "extend", made, *pair.shape)
+            predicted = self._model.extend(pair, level, conditioning, self._cache)
             self._cache.keep(done)
             self._unkept = None
             return predicted[:, done:]

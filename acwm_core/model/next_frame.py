@@ -23,7 +23,6 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, LatentStream
 from acwm_core.model.flow import Flow, drawn_noise, mix
 from acwm_core.model.shapes import Latent, Sigmas
-from acwm_core.plugin_code import shaped
 
 
 class Extendable(Protocol):
@@ -75,8 +74,7 @@ def loss(
     after = replace(conditioning, previous=mix(_before(past), noise, sigma), previous_sigma=sigma)
 
     def denoise(noisy: Latent, level: Sigmas) -> Latent:
-        made = shaped(model, "forward", model(noisy, level, after), *noisy.shape)
-        return _predicted(model, made, after)
+        return _predicted(model, model(noisy, level, after), after)
 
     return flow.loss(denoise, latents, generators, model.given_frames)
 
@@ -131,7 +129,7 @@ class NextFrameStream(LatentStream):
 
         def denoise(noisy: Latent, sigma: Sigmas) -> Latent:
             made = self._model.extend(noisy, sigma, after, self._cache)
-            return _predicted(self._model, shaped(self._model, "extend", made, *last.shape), after)
+            return _predicted(self._model, made, after)
 
         noise = drawn_noise(last.shape[1:], self._generators).to(last)
         self._last = self._model.flow.sample(denoise, noise, noise[:, :0], self._steps)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,6 @@ from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.model.stream import Stream, continued
-from acwm_core.plugin_code import WrongResultError, shaped
 
 CLIP_FRAMES = 37
 """Frames per clip: 10 latent frames at a temporal stride of 4 (the published window)."""
@@ -88,10 +87,7 @@ class WorldModel(nn.Module):
 
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
-        own: list[Any] = self.model.matrices() or []
-        if any(getattr(each, "ndim", 0) != 2 for each in own):
-            raise WrongResultError(self.model, "matrices", own, "a list of matrices")
-        return [*own, *hidden_matrices(self.conditioner)]
+        return [*(self.model.matrices() or []), *hidden_matrices(self.conditioner)]
 
     @torch.no_grad()
     def encode(self, video: Video) -> Latent:
@@ -112,7 +108,7 @@ class WorldModel(nn.Module):
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         rows = self._prepare(actions, latents.shape[1])
         conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
-        return shaped(self.model, "loss", self.model.loss(latents, conditioning, generators))
+        return self.model.loss(latents, conditioning, generators)
 
     def rollout(
         self,
@@ -264,8 +260,7 @@ class WorldModel(nn.Module):
         rows = self._prepare(actions, length)
         conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
-            made = self.model.predict(latents, conditioning, length, generators, steps)
-            latents = shaped(self.model, "predict", made, len(given), length, *latents.shape[2:])
+            latents = self.model.predict(latents, conditioning, length, generators, steps)
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:

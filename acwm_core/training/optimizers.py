@@ -16,7 +16,6 @@ from torch.optim import AdamW, Muon, Optimizer
 from acwm_core.errors import AcwmWarning
 from acwm_core.model.dynamics import hidden_matrices
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 from acwm_core.training.config import TrainingConfig
 
 
@@ -30,9 +29,8 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     hidden: list[nn.Parameter] = []
     if config.optimizer == "muon":
-        with blaming("as the optimizer was built"):
-            is_ours = isinstance(module, WorldModel)
-            hidden = module.matrices() if is_ours else hidden_matrices(module)
+        is_ours = isinstance(module, WorldModel)
+        hidden = module.matrices() if is_ours else hidden_matrices(module)
         if not hidden:
             warnings.warn(
                 "the model names no hidden matrices for Muon: AdamW updates all of it",

@@ -12,8 +12,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch.optim import Optimizer
 
 from acwm_core.data.atomic import disk_error
-from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.plugin_code import explained
+from acwm_core.errors import AcwmError, TrainingError, sentence
 
 if TYPE_CHECKING:
     from acwm_core.training.task import WorldModelTask
@@ -80,6 +79,6 @@ def restored(checkpoint: Path | None, task: WorldModelTask) -> Generator[None]:
         if checkpoint is None or task.has_stepped or isinstance(error, others) or disk_error(error):
             raise
         raise TrainingError(
-            f"training cannot continue from {checkpoint} ({explained(error)[:300]}): restore it "
+            f"training cannot continue from {checkpoint} ({sentence(error)[:300]}): restore it "
             "from a backup, or start a new training; --traceback shows all of it"
         ) from error

@@ -15,10 +15,9 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from acwm_core.errors import TrainingError
+from acwm_core.errors import TrainingError, noting
 from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.layers import recompute_activations, shard, trained_layers
@@ -101,7 +100,7 @@ class WorldModelTask(L.LightningModule):
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
-        with blaming(f"in training step {self.global_step + 1}"):
+        with noting(f"in training step {self.global_step + 1}", *self.world_model.children()):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
         check_gradient(loss, self.world_model)
@@ -116,14 +115,14 @@ class WorldModelTask(L.LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss of the averaged weights, with noise that depends only on the clip."""
         generators = [generator_of(0, VALIDATION_NOISE, place) for place in batch["positions"]]
-        with blaming(f"in validation after step {self.global_step}"):
+        with noting(f"in validation after step {self.global_step}", *self.averaged.children()):
             loss = self.averaged.loss(self.latents(batch), batch["actions"], generators)
         clips = len(batch["actions"])
         self.log("val/loss", loss, prog_bar=True, batch_size=clips, sync_dist=True)
 
     def rollout(self, given: Video, actions: Actions, **options: Any) -> Video:
         """Predict with the averaged weights; `actions` are raw actions as recorded."""
-        with blaming(f"in a rollout after step {self.global_step}"):
+        with noting(f"in a rollout after step {self.global_step}", *self.averaged.children()):
             return self.averaged.rollout(given, actions, check=False, **options)
 
     def latents(self, batch: Batch) -> Latent:

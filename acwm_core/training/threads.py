@@ -13,8 +13,8 @@ from typing import Any, cast
 import lightning as L
 import torch
 
+from acwm_core.errors import noting
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 from acwm_core.training.data_module import ClipData
 from acwm_core.training.task import check_gradient
 
@@ -34,7 +34,7 @@ def found_threads(trainer: L.Trainer, world_model: WorldModel, data: ClipData) -
     clips = data.config.batch_size, data.frames
     size = data.episodes.card.environment.frame_size
     precision = cast(Any, trainer).precision_plugin.forward_context
-    with blaming("while numbers of threads were tried"):
+    with noting("while numbers of threads were tried", *world_model.children()):
         return fastest_threads(world_model, clips, size, precision)
 
 

@@ -16,12 +16,11 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
-from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors import DataError, RecipeError, noting, suggest
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
-from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (
@@ -221,7 +220,7 @@ class Dreams:
             spare = np.array(self.card.action.low, np.float32)
             rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
             held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
-            with blaming("while the model predicts", self._world.model):
+            with noting("while the model predicts", *self._world.children()):
                 video = group.stream.step(held.to(self._world.action_low.device))
             pixels = to_pixels(video.flatten(0, 1)).reshape(*video.shape[:2], *self._shape)
             shown |= {m: pixels[k] for k, m in enumerate(group.members) if m in taken}
@@ -235,7 +234,7 @@ class Dreams:
         device = self._world.action_low.device
         video = torch.stack([_video(start.frames) for start in starts]).to(device)
         between = torch.from_numpy(np.stack([start.actions for start in starts])).to(device)
-        with blaming("when the model begins", self._world.model):
+        with noting("when the model begins", *self._world.children()):
             return self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
 
     def _judged(self, which: Sequence[int], frames: Frames) -> Seen:

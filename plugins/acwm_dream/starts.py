@@ -13,8 +13,7 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal, Task, TaskEnvironment
-from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.plugin_code import blaming
+from acwm_core.errors import DataError, RecipeError, noting, suggest
 
 
 class Start(NamedTuple):
@@ -63,7 +62,7 @@ class SimulatorStarts(Starts):
 
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
         """See `Starts.draw`. The options are those of `Environment.reset`."""
-        with blaming("when a dream begins", self._inner):
+        with noting("when a dream begins", self._inner):
             seed = int(rng.integers(2**31))
             frame, info = self._environment.reset(seed=seed, options=dict(options))
             frames, actions = [frame], list[NDArray[np.float32]]()

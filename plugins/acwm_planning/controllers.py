@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import RecipeError
-from acwm_core.plugin_code import WrongResultError, numbers
+from acwm_core.errors import PluginError, RecipeError, check_shape
 from acwm_planning.futures import History
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_planning.search import SearchPlanner
@@ -101,7 +100,8 @@ class Scripted(Controller):
     def act(self, history: History) -> Actions:
         """One action, because the script looks at the simulator before each action."""
         assert self._policy is not None
-        action = numbers(self._task, self._method, self._policy(), len(self._low))
+        action = np.asarray(self._policy())
+        check_shape(self._task, self._method, action, len(self._low))
         check_bounds(self._task, self._method, action, self._low, self._high)
         return [action.astype(np.float32)]
 
@@ -195,11 +195,10 @@ class Planned(Controller):
         cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
         plan = self._planner.plan(cost, self._low, self._high, self._generator)
         seconds, taken = time.perf_counter() - began, self._planner.actions_per_plan
-        numbers(self._planner, "actions_per_plan", taken)
         first = self._checked(plan)[: max(0, taken)]
         if not len(first):
-            wanted = f"actions of which to take {taken}"
-            raise WrongResultError(self._planner, "plan", plan.actions, wanted)
+            owner = type(self._planner).__name__
+            raise PluginError(f"{owner} plans no actions, or actions_per_plan = {taken} takes none")
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))
         return [*first]
 
@@ -222,14 +221,10 @@ class Planned(Controller):
         """The actions `[T, A]` of a valid plan.
 
         Raises:
-            WrongResultError: the planner returned something invalid.
+            PluginError: the actions have another size, or are not valid for the environment.
         """
-        if not isinstance(plan, Plan):
-            raise WrongResultError(self._planner, "plan", plan, "a Plan")
-        numbers(self._planner, "plan (cost)", plan.cost)
-        numbers(self._planner, "plan (evaluations)", plan.evaluations)
-        actions = torch.as_tensor(plan.actions).detach().cpu().numpy()
-        actions = numbers(self._planner, "plan", actions, -1, len(self._low)).astype(np.float32)
+        actions = torch.as_tensor(plan.actions).detach().cpu().numpy().astype(np.float32)
+        check_shape(self._planner, "plan", actions, -1, len(self._low))
         check_bounds(self._planner, "plan", actions, self._low.numpy(), self._high.numpy())
         return actions
 
@@ -244,11 +239,13 @@ def check_bounds(
     """Refuse actions `[…, A]` that are not valid for the environment.
 
     Raises:
-        WrongResultError: an action is not finite, or out of bounds by more than rounding.
+        PluginError: an action is not finite, or out of bounds by more than rounding.
     """
     slack = 1e-6 * (high - low)
     wrong = ~((actions >= low - slack) & (actions <= high + slack))
     if wrong.any():
         value = actions[wrong][0]
-        wanted = f"actions from {[*map(float, low)]} to {[*map(float, high)]}"
-        raise WrongResultError(component, method, float(value), wanted)
+        bounds = f"from {[*map(float, low)]} to {[*map(float, high)]}"
+        raise PluginError(
+            f"{type(component).__name__}.{method} gives {value:g}, not actions {bounds}"
+        )

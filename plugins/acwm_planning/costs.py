@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from acwm_core.env.task import Goal, Task, judged
-from acwm_core.errors import RecipeError
-from acwm_core.plugin_code import WrongResultError, named_by_user
+from acwm_core.errors import RecipeError, noting
+from acwm_core.recipe.trust import import_named
 from acwm_planning.planner import Cost, Futures
 
 
@@ -90,13 +90,12 @@ class UserCost(Cost):
     """
 
     def __init__(self, *, function: str) -> None:
-        self.function = named_by_user(function, f"cost.function={function}")
+        self.name = function
+        self.function = import_named(function, f"cost.function={function}")
         if not callable(self.function):
             raise RecipeError(f"cost.function={function} is not a function")
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """See `Cost`."""
-        made = torch.as_tensor(self.function(futures, task, goal))
-        if made.is_complex():
-            raise WrongResultError(self, "cost", made, "real numbers")
-        return made.float()
+        with noting(f"in cost.function={self.name}", self.function):
+            return torch.as_tensor(self.function(futures, task, goal)).float()

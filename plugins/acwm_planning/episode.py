@@ -11,7 +11,7 @@ from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, TaskEnvironment
-from acwm_core.plugin_code import blaming, mark
+from acwm_core.errors import noting
 from acwm_planning.controllers import Controller, Decision, Planned
 from acwm_planning.futures import History
 
@@ -33,7 +33,6 @@ class TaskVariant(Task):
         self.name, self.summary, self.unit = task.name, task.summary, task.unit
         self.tolerance, self.avoid = task.tolerance, task.avoid
         self.max_steps = max_steps or task.max_steps
-        mark(self, f"task {task.name!r}")
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
         """See `Task.sample_goal`."""
@@ -99,9 +98,9 @@ def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller
     Raises:
         RecipeError: the episode has no goal, or the controller cannot act in it.
         ActionError: an action is out of bounds.
-        PluginError: the environment, the task or the controller raised another error.
     """
-    with blaming(f"in episode {spec.index} of {spec.split}", environment.environment):
+    parts = environment.environment, environment.task, controller
+    with noting(f"in episode {spec.index} of {spec.split}", *parts):
         frame, info = environment.reset(options={"spec": spec})
         history, distances = History(spec, [frame]), [info["distance"]]
         controller.begin(environment.environment, environment.task, environment.goal)

@@ -15,12 +15,11 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
-from acwm_core.errors import DataError, RecipeError
+from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import shaped
 from acwm_planning.planner import Cost, Futures, RolloutCost
 
 
@@ -197,7 +196,8 @@ class ModelRollouts:
             costs: list[Tensor] = []
             for part in actions.split(self._batch):
                 futures = self._futures(given, taken, part, seed, stills)
-                found = shaped(judge, "cost", judge(futures, task, goal), len(part)).cpu()
+                found = judge(futures, task, goal).cpu()
+                check_shape(judge, "__call__", found, len(part))
                 # An estimator may read something from a picture that is not finite.
                 costs.append(torch.where(futures.finite.cpu(), found, torch.nan))
             return torch.cat(costs)
@@ -259,8 +259,7 @@ class ModelRollouts:
         conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
-        made = world.model.predict(given, conditioning, length, generators, self._steps)
-        return shaped(world.model, "predict", made, number, length, *given.shape[2:])
+        return world.model.predict(given, conditioning, length, generators, self._steps)
 
     def _known(self, given: Latent, taken: Tensor) -> int:
         """Number of video frames from the first given one to the current one."""

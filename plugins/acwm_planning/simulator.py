@@ -12,10 +12,9 @@ from torch import Tensor
 from acwm_core.env.environment import Environment
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task, observed
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, check_shape
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Actions, Latent, Video
-from acwm_core.plugin_code import shaped
 from acwm_planning.futures import History, still_latent, tensor_of
 from acwm_planning.planner import Cost, Futures, RolloutCost
 
@@ -147,6 +146,8 @@ class SimulatorRollouts:
             made = SimulatorFutures(
                 self.environment, history, actions, self._stride, self._codec, self._estimator
             )
-            return shaped(judge, "cost", judge(made, task, goal), len(actions))
+            costs = judge(made, task, goal)
+            check_shape(judge, "__call__", costs, len(actions))
+            return costs
 
         return cost

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.task import Goal
-from acwm_core.errors import AcwmError
-from acwm_core.plugin_code import WrongResultError, blaming, numbers
+from acwm_core.errors import AcwmError, PluginError, check_shape, noting
 from acwm_planning.planner import Driver
 from acwm_play.simulator import Moment
 from acwm_play.stage import Stage
@@ -120,7 +119,7 @@ class Attempt:
         self._check()
         task, card = stage.tasks[self._task], stage.simulator.card
         driver = stage.workers.driver(self._name, stage.world, card, task)
-        with blaming("when it begins", driver):
+        with noting(f"when the driver {self._name!r} begins", driver):
             driver.begin(goal, still, stage.scene.index)
         return driver
 
@@ -130,11 +129,11 @@ class Attempt:
         """The next actions `[n, A]`, and how many seconds the decision took."""
         self._check()
         began = time.monotonic()
-        with blaming("while it drives", driver):
+        with noting(f"while {self._name!r} drives", driver):
             made = np.asarray(driver.act(frames, actions, self._check), np.float32)
-            numbers(driver, "act", made, -1, self._stage.simulator.card.action.size)
+            check_shape(driver, "act", made, -1, self._stage.simulator.card.action.size)
             if not len(made):
-                raise WrongResultError(driver, "act", made, "at least one action")
+                raise PluginError(f"{type(driver).__name__}.act gives no action")
         return made, time.monotonic() - began
 
     def _check(self) -> None:

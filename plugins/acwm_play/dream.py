@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError, noting
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 
 Frames = NDArray[np.uint8]
 
@@ -75,7 +74,7 @@ class Dream:
         """
         video = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)[None] / 255
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
-        with blaming("when the model begins", self._world.model):
+        with noting("when the model begins", *self._world.children()):
             self._stream = self._world.stream(video, between, steps=self._steps)
             if isinstance(self._world.model, Denoiser):
                 self._others = self._world.stream(
@@ -90,7 +89,7 @@ class Dream:
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
         """Predict the frames `[stride, H, W, 3]` uint8 for `stride` raw actions."""
         rows, began = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
-        with blaming("while the model predicts", self._world.model):
+        with noting("while the model predicts", *self._world.children()):
             seen = self._stream.step(rows)
             self.spread = None
             if self._others is not None:

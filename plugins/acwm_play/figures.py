@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.errors import AcwmError
+from acwm_core.errors import sentence
 from acwm_core.evaluation.metric import Metric, Rollout
 from acwm_core.plugins import catalog
 from acwm_play.simulator import Moment
@@ -59,8 +59,8 @@ class Instruments:
         try:
             component = catalog().component("estimator", card.name)
             self._estimator = component.create_as(StateEstimator, card=card)
-        except AcwmError as error:
-            self.why_not = str(error)
+        except Exception as error:  # whatever a plugin raises
+            self.why_not = sentence(error)
         known = catalog().registry("metric")
         made = {name: known[name].create_as(Metric) for name in METRICS if name in known}
         usable = self._estimator is not None

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Physics
-from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
 from acwm_play.simulator import Scene, Simulator
 
@@ -41,7 +40,7 @@ def physics_of(environment: str) -> Physics | None:
         return None
     try:
         physics = component.load_physics()
-    except AcwmError:
+    except Exception:  # whatever a plugin raises as it is imported
         return None
     return physics if isinstance(physics, Physics) else None
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal
-from acwm_core.errors import AcwmError, PluginError, RecipeError
+from acwm_core.errors import PluginError, RecipeError, sentence
 from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import Moment, Scene, Simulator, Standing
 
@@ -151,6 +151,6 @@ def _answered(work: Any, *args: Any) -> tuple[bool, Any]:
     """The result, or class and text of an error; some errors cannot be sent between processes."""
     try:
         return True, work(*args)
-    except AcwmError as error:
+    except Exception as error:
         kind = RecipeError if isinstance(error, RecipeError) else PluginError
-        return False, (kind, str(error))
+        return False, (kind, sentence(error))

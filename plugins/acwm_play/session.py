@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.errors import AcwmError
+from acwm_core.errors import AcwmError, is_for_users, sentence
 from acwm_play import messages
 from acwm_play.clock import SPEEDS, Clock
 from acwm_play.figures import pixel_error
@@ -101,8 +101,10 @@ class Session:
             while True:
                 try:
                     await self._go_on()
-                except AcwmError as error:
-                    self._tell("notice", text=str(error), wrong=True)
+                except Exception as error:
+                    if not is_for_users(error):
+                        raise
+                    self._tell("notice", text=sentence(error), wrong=True)
                     self._predicting = None
                     self._wheel.stop()
                     await self._save()
@@ -135,7 +137,7 @@ class Session:
     async def _open(self, wanted: messages.Open) -> None:
         self._wanted, self._take_over = None, False
         self._wheel.stop()
-        with contextlib.suppress(AcwmError):
+        with contextlib.suppress(Exception):  # it was shown
             await self._settled()
         await self._save()
         stage, before = await self._set_up(wanted.world)
@@ -143,10 +145,10 @@ class Session:
         scene = Scene.drawn(factors) if wanted.index is None else Scene(wanted.index, factors)
         try:
             moment, seen = await stage.begin(scene)
-        except AcwmError as error:
-            if before is None:
+        except Exception as error:
+            if before is None or not is_for_users(error):
                 raise
-            self._tell("notice", text=str(error), wrong=True)
+            self._tell("notice", text=sentence(error), wrong=True)
             moment, seen = await stage.begin(before)  # the last scene that worked
         self._wheel.begin(stage)
         self.outbox.forget_frames()
@@ -225,8 +227,10 @@ class Session:
         """Whether the next action is known; if not, wait until a driver has planned it."""
         try:
             return await self._wheel.ready(stage, self._wake)
-        except AcwmError as error:
-            self._tell("notice", text=str(error), wrong=True)
+        except Exception as error:
+            if not is_for_users(error):
+                raise
+            self._tell("notice", text=sentence(error), wrong=True)
             self._tell_state()
             return False
 
@@ -268,8 +272,10 @@ class Session:
         run = self._house.workers.run
         try:
             read = await run("instruments", stage.instruments.read, seen, moment, floor)
-        except AcwmError as error:
-            self._tell("notice", text=str(error), wrong=True)
+        except Exception as error:
+            if not is_for_users(error):
+                raise
+            self._tell("notice", text=sentence(error), wrong=True)
             return
         if stage is self._stage and scene is stage.scene:
             self._floor_of, self._floors = scene, read.floors or self._floors

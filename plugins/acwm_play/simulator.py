@@ -14,7 +14,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec, FactorValue
 from acwm_core.env.task import Goal, Task, TaskEnvironment
-from acwm_core.plugin_code import blaming
+from acwm_core.errors import noting
 from acwm_core.plugins import catalog
 
 SCENES = 100_000
@@ -106,7 +106,7 @@ class Simulator:
             RecipeError: the environment does not have such a factor or value.
         """
         spec = EpisodeSpec(self.card.name, "train", scene.index, factors=dict(scene.factors))
-        with blaming(f"in scene {scene.index}", self.environment):
+        with noting(f"in scene {scene.index}", self.environment):
             frame, info = self.environment.reset(options={"spec": spec})
         self._spec, self._policy = spec, None
         self._goals, self._aiming = {}, None
@@ -118,7 +118,7 @@ class Simulator:
         action_spec = self.card.action
         low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
         taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
-        with blaming("while playing", self.environment):
+        with noting("while playing", self.environment):
             frame, _, _, _, info = (self._aiming or self.environment).step(taken)
         return self._moment(frame, info, taken)
 
@@ -132,7 +132,7 @@ class Simulator:
             RecipeError: the scene has no goal that is not reached at its start.
         """
         found: Task = catalog().component("environment", self._name).load_task(task)
-        with blaming(f"in scene {self._spec.index}", self.environment):
+        with noting(f"in scene {self._spec.index}", self.environment):
             if task not in self._goals:
                 if self._second is None:
                     size = {"size": list(self.card.frame_size)}
@@ -152,7 +152,7 @@ class Simulator:
 
     def step_by_policy(self, anew: bool) -> Moment:
         """Advance by one frame with the behaviour policy; `anew` restarts the policy from here."""
-        with blaming("while its policy drives", self.environment):
+        with noting("while its policy drives", self.environment):
             if self._policy is None or anew:
                 self._takeovers += 1
                 rng = self._spec.rng(f"play:{self._takeovers}")

@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
 from acwm_play import messages
 from acwm_play.attempt import Attempt
@@ -75,7 +74,7 @@ class Wheel:
         """Whether the next action is known; if not, wait until it is, or until `wake` is set.
 
         Raises:
-            AcwmError: a driver failed; the person drives again.
+            Exception: a driver failed; the person drives again.
         """
         self._choose(stage)
         if self._task is None or self.driver in (PERSON, POLICY):
@@ -84,7 +83,7 @@ class Wheel:
             self._attempt = Attempt(stage, self.driver, self._task, self._tell)
         try:
             return await self._attempt.ready(wake)
-        except AcwmError:
+        except Exception:
             self.hand_to(PERSON)
             raise
 

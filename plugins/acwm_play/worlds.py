@@ -11,7 +11,7 @@ from typing import Any
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.task import Task
-from acwm_core.errors import AcwmError, RecipeError, TrainingError
+from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, RunFolder, load_run
 from acwm_core.training.trained import find_run, trained_models
@@ -101,7 +101,7 @@ def tasks_of(environment: str) -> dict[str, Task]:
     component = catalog().component("environment", environment)
     found: dict[str, Any] = {}
     for name in component.tasks:
-        with contextlib.suppress(AcwmError):
+        with contextlib.suppress(Exception):  # whatever a plugin raises
             found[name] = component.load_task(name)
     return {name: task for name, task in found.items() if isinstance(task, Task)}
 

@@ -126,8 +126,7 @@ def test_a_missing_module_of_its_own_is_told(install: Install) -> None:
         """,
     )
     catalog = loaded()
-    gone = "codec 'bug' of plugin 'plugin_bug' cannot be imported: .* 'plugin_bug.nowhere'"
-    with pytest.raises(PluginError, match=gone):
+    with pytest.raises(ModuleNotFoundError, match="in codec 'bug' of plugin 'plugin_bug'"):
         catalog.component("codec", "bug").load()
     with pytest.raises(PluginError, match="plugin_bug has no 'Nothing'"):
         catalog.component("codec", "bugger").load()

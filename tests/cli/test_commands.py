@@ -14,7 +14,6 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
-from acwm_core import plugin_code
 from acwm_core.cli import main
 from acwm_core.cli.main import AcwmGroup
 from acwm_core.interrupts import exit_by_signal
@@ -227,11 +226,8 @@ def test_check_of_a_metric_takes_its_parameters_and_an_environment() -> None:
     assert "write metric.PARAMETER=VALUE or env=NAME" in wrong
 
 
-def test_a_command_of_a_plugin_ends_as_click_commands_do(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_command_of_a_plugin_ends_as_click_commands_do() -> None:
     """An exit code, a usage error, and a signal are no errors of the plugin."""
-    monkeypatch.setattr(plugin_code, "AUTHORS", {__name__.partition(".")[0]})
     codes: dict[str, tuple[int, str]] = {}
 
     @click.command()

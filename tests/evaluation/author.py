@@ -1,6 +1,5 @@
 """Components as authors break them, each in its own way."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -29,11 +28,6 @@ class RaisingWorld(World):
         if self._frame_index == 3:
             raise ZeroDivisionError("no\nground")  # line of RaisingWorld
         super()._advance(action)
-
-
-class EndingWorld(World):
-    def _start(self, factors, rng):
-        sys.exit(0)  # line of EndingWorld
 
 
 class UnfinishedWorld(World):
@@ -95,7 +89,7 @@ class RaisingModel(LinearModel):
 
 TARGETS = {
     "environment": (
-        *("RaisingWorld", "EndingWorld", "UnfinishedWorld", "HalfWorld", "PolicyWorld"),
+        *("RaisingWorld", "UnfinishedWorld", "HalfWorld", "PolicyWorld"),
         *("ScalarPolicyWorld", "LongPolicyWorld", "FixedSizeWorld", "NamelessWorld"),
     ),
     "metric": ("RaisingMetric", "UnfinishedMetric", "DriftMetric"),

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Frame, Goal
-from acwm_core.errors import RecipeError
-from acwm_core.plugin_code import blaming, named_by_user
+from acwm_core.errors import RecipeError, noting
+from acwm_core.recipe.trust import import_named
 
 
 class OwnPolicy:
@@ -40,7 +40,7 @@ class OwnPolicy:
 
     def __init__(self, name: str, card: EnvironmentCard) -> None:
         self.name, self._card = name, card
-        made = named_by_user(name, f"the policy {name}")
+        made = import_named(name, f"the policy {name}")
         if isinstance(made, type):
             made = self._asked("made", made)
         if not (callable(getattr(made, "predict", None)) or callable(made)):
@@ -76,8 +76,7 @@ class OwnPolicy:
             made = self._asked("called", act, frame if self.observes == "frame" else state)
             made = made[0] if isinstance(made, tuple) else made
         spec = self._card.action
-        with blaming("when called", f"the policy {self.name}"):
-            action = np.asarray(made)
+        action = np.asarray(made)
         if action.shape != (spec.size,) or not is_finite(action):
             raise RecipeError(
                 f"the policy {self.name} returned an array of shape {np.shape(made)}, but "
@@ -86,7 +85,7 @@ class OwnPolicy:
         return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
 
     def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
-        with blaming(f"when {doing}", f"the policy {self.name}"):
+        with noting(f"when the policy {self.name} was {doing}", self.name):
             return function(*arguments)
 
 

@@ -20,7 +20,6 @@ from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.evaluation.simulator import plan_branches
 from acwm_core.executors import progress_bar
-from acwm_core.plugin_code import blaming
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
@@ -72,10 +71,6 @@ class Ranker:
 
     def lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
         """Results for some of `names`, from the start of a seed."""
-        with blaming(f"in episode {seed} of {SPLIT}"):
-            return self._lines(seed, wanted)
-
-    def _lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
         start = self._simulator.start(self._spec(seed))
         chosen = [policy for policy in self.policies if policy.name in wanted]
         open_loop = [policy for policy in chosen if isinstance(policy, ScriptedPolicy)]

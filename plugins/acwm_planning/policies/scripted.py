@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from dataclasses import dataclass
 from typing import Literal, cast
@@ -13,8 +12,7 @@ import numpy as np
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import RecipeError, suggest
-from acwm_core.plugin_code import WrongResultError, numbers
+from acwm_core.errors import PluginError, RecipeError, check_shape, suggest
 
 Script = Literal["solution", "behaviour"]
 
@@ -80,9 +78,10 @@ class ScriptedPolicy:
 
         def disturbed() -> np.ndarray:
             still = environment.still_action()
-            wanted = numbers(owner, method, script(), len(low)).astype(np.float64)
+            wanted = np.asarray(script(), np.float64)
+            check_shape(owner, method, wanted, len(low))
             if not np.isfinite(wanted).all():
-                raise WrongResultError(owner, method, math.nan, "finite numbers")
+                raise PluginError(f"{type(owner).__name__}.{method} gives numbers not finite")
             pushed = self.noise * next(noise) + self.bias * side
             made = still + self.skill * (wanted - still) + pushed * (high - low) / 2
             return np.clip(made.astype(np.float32), low, high)

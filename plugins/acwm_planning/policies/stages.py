@@ -13,9 +13,9 @@ from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task, TaskEnvironment
+from acwm_core.errors import noting
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugin_code import blaming
 from acwm_planning.policies.episode import Outcome, Played, Start, joined, judged, outcome
 from acwm_planning.policies.own import OwnPolicy
 
@@ -51,11 +51,12 @@ class SimulatorStage(Stage):
     ) -> None:
         self.environment, self._given, self._stride = environment, given, stride
         self._estimator = estimator
+        self._parts = environment.environment, environment.task
 
     def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> Start:
         """Start an episode, with its own goal or with a given one."""
         options = {"spec": spec, **({} if goal is None else {"goal": goal})}
-        with blaming(f"in episode {spec.index} of {spec.split}", self.environment.environment):
+        with noting(f"in episode {spec.index} of {spec.split}", *self._parts):
             frame, info = self.environment.reset(options=options)
             frames, actions = [frame], list[NDArray[np.float32]]()
             for _ in range(self._given - 1):
@@ -70,9 +71,8 @@ class SimulatorStage(Stage):
     def play(self, start: Start, begin: Callable[[Environment], Policy], steps: int) -> Played:
         """Play one episode with a policy that looks at the simulator."""
         self.start(start.spec, start.goal)
-        inner = self.environment.environment
-        with blaming(f"in episode {start.spec.index} of {start.spec.split}", inner):
-            return self._go_on(start, begin(inner), steps)
+        with noting(f"in episode {start.spec.index} of {start.spec.split}", *self._parts):
+            return self._go_on(start, begin(self.environment.environment), steps)
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
         """See `Stage.replay`."""
@@ -149,7 +149,7 @@ class ModelStage(Stage):
         asked = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
         given = self._given(start).expand(number, -1, -1, -1, -1)
         seeds, parts = [start.spec.index] * number, list[list[Observation]]()
-        with blaming(_when(start), self._world.model):
+        with noting(_when(start), *self._world.children()):
             chunks = self._world.rollout_chunks(given, asked, steps=self._steps, seeds=seeds)
             for chunk in chunks:
                 new = chunk[:, max(0, known) :]
@@ -173,7 +173,7 @@ class ModelStage(Stage):
         for _ in range(0, steps, stride):
             action = decision(policy, pixels(frame), self._estimator)
             rows = torch.from_numpy(np.stack([action] * stride))[None].to(self._device)
-            with blaming(_when(start), self._world.model):
+            with noting(_when(start), *self._world.children()):
                 frames = stream.step(rows)[0]
             frame = frames[-1]
             parts.append(self._estimator.read(frames.cpu()))
