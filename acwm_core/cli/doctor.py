@@ -30,10 +30,14 @@ _MARKS = {True: "[green]ok[/green]", False: "[bold red]no[/bold red]", None: "[d
 _TRIAL = """
 import sys
 from acwm_core.data.simulate import make_environment
-environment = make_environment(sys.argv[1], {})
-environment.reset(seed=0)
-environment.step((environment.action_space.low + environment.action_space.high) / 2)
-environment.close()
+from acwm_core.errors import sentence
+try:
+    environment = make_environment(sys.argv[1], {})
+    environment.reset(seed=0)
+    environment.step((environment.action_space.low + environment.action_space.high) / 2)
+    environment.close()
+except Exception as error:
+    sys.exit(sentence(error))
 """
 
 
@@ -107,7 +111,7 @@ def trial(component: Component) -> Finding:
         return Finding(what, None, needs)
     engine = _versions(component)
     try:
-        command = [sys.executable, "-c", _TRIAL, component.name]
+        command = [sys.executable, "-P", "-c", _TRIAL, component.name]
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=TRIAL_SECONDS)
     except subprocess.TimeoutExpired:
         return Finding(what, False, f"no frame after {TRIAL_SECONDS} s ({engine})")
@@ -141,7 +145,6 @@ def _accelerator() -> str:
 
 def _reason(stderr: str) -> str:
     line = (stderr.strip().splitlines() or [""])[-1]
-    line = line.removeprefix("acwm_core.errors.PluginError: ")
     library = re.search(r"(lib\w+\.so)\S*: cannot open shared object", line)
     if library and library[1] in SYSTEM_PACKAGES:
         line += f"; sudo apt-get install {SYSTEM_PACKAGES[library[1]]}"

@@ -8,6 +8,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,7 +20,7 @@ from acwm_core.cli.doctor import doctor
 from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
 from acwm_core.data.atomic import disk_error
-from acwm_core.errors import AcwmError, AcwmWarning, is_for_users, sentence, suggest
+from acwm_core.errors import AcwmError, AcwmWarning, is_for_users, noting, sentence, suggest
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.plugins import catalog
 from acwm_core.renamed import RenamedWarning
@@ -78,7 +79,8 @@ class AcwmGroup(click.Group):
         shown = "--traceback" in words
         words = [word for word in words if word != "--traceback"]  # at any position
         try:
-            result = super().main(words, *more, **{**extra, "standalone_mode": False})
+            with _named_if_of_others(words):
+                result = super().main(words, *more, **{**extra, "standalone_mode": False})
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
             sys.exit(error.exit_code)
@@ -96,11 +98,21 @@ class AcwmGroup(click.Group):
         sys.exit(result if isinstance(result, int) else 0)
 
 
+def _named_if_of_others(words: Sequence[str]) -> AbstractContextManager[None]:
+    """Add a note to errors in a command that another package brings."""
+    name = next((word for word in words if not word.startswith("-")), None)
+    brought = catalog().registry("command") if name else ()
+    if name is None or name not in brought or brought[name].distribution == "acwm":
+        return contextlib.nullcontext()
+    command = brought[name]
+    return noting(f"in {command.part} of plugin {command.plugin!r}", command.target)
+
+
 def _report(error: Exception, with_traceback: bool) -> NoReturn:
     """End the command with a sentence about `error`; raises it if it is a bug in acwm."""
     if with_traceback:
         traceback.print_exception(error)
-    _refuse_a_deleted_folder(error)
+    _refuse_a_deleted_folder()
     found = None if isinstance(error, AcwmError) else disk_error(error)
     if found is not None:
         where = f"{found.filename}: " if found.filename else ""
@@ -121,13 +133,12 @@ def _print_anything() -> None:
                 stream.reconfigure(errors="replace")
 
 
-def _refuse_a_deleted_folder(error: BaseException | None) -> None:
-    """End the command if `error` arose because the current folder was deleted."""
-    if isinstance(error, FileNotFoundError):
-        try:
-            Path.cwd()
-        except FileNotFoundError:
-            _fail("the current folder was deleted; change to another one", 2)
+def _refuse_a_deleted_folder() -> None:
+    """End the command if the current folder was deleted, which causes many errors."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        _fail("the current folder was deleted; change to another one", 2)
 
 
 _show_any_warning = warnings.showwarning

@@ -120,21 +120,21 @@ def simulate(
             taken[index] = action
             frame, _, _, _, info = environment.step(action)
             look(frame, info)
-    expect(environment.card == card, "the environment replaces its card within the episode")
-    names = infos[0]["state"].keys()
-    for info in infos:
-        expect(info["state"].keys() == names, f"the state fields are {sorted(info['state'])}")
-    contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
-    return Episode(
-        spec=spec,
-        video=_stacked("frames", video),
-        actions=taken,
-        states={n: _stacked(f"state {n}", [info["state"][n] for info in infos]) for n in names},
-        masks=_stacked("masks", [info["mask"] for info in infos]),
-        contacts=np.array(contacts, np.int32).reshape(-1, 3),
-        factors=infos[0]["factors"],
-        ood_label=infos[0]["ood_label"],
-    )
+        expect(environment.card == card, "the environment replaces its card within the episode")
+        names = infos[0]["state"].keys()
+        for info in infos:
+            expect(info["state"].keys() == names, f"the state fields are {sorted(info['state'])}")
+        contacts = [(index, *pair) for index, info in enumerate(infos) for pair in info["contacts"]]
+        return Episode(
+            spec=spec,
+            video=_stacked("frames", video),
+            actions=taken,
+            states={n: _stacked(f"state {n}", [info["state"][n] for info in infos]) for n in names},
+            masks=_stacked("masks", [info["mask"] for info in infos]),
+            contacts=np.array(contacts, np.int32).reshape(-1, 3),
+            factors=infos[0]["factors"],
+            ood_label=infos[0]["ood_label"],
+        )
 
 
 def _stacked(what: str, values: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -89,8 +89,8 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
     what, works, note = doctor.trial(component)
     assert (what, works) == ("environment broken", False)
     assert note == (
-        "environment 'broken' of plugin 'broken_engine' cannot be imported: ImportError: "
-        f"{library} ({tmp_path}/broken_engine.py:1); sudo apt-get install libx11-6"
+        f"ImportError: {library}, in environment 'broken' of plugin 'broken_engine' "
+        f"({tmp_path}/broken_engine.py:1); sudo apt-get install libx11-6"
     )
 
 

@@ -69,7 +69,7 @@ def test_impossible_requests_are_refused(square):
 def test_environments_that_cannot_be_made_are_refused():
     with pytest.raises(UnknownNameError, match="did you mean 'square'"):
         make_environment("sqare")
-    with pytest.raises(PluginError, match="colour_scheme"):
+    with pytest.raises(TypeError, match="colour_scheme"):
         make_environment("square", {"colour_scheme": "dark"})
     with pytest.raises(ShapeError, match="multiple of 8"):
         make_environment("square", {"size": 30})

@@ -155,18 +155,16 @@ def test_a_torch_module_sees_pictures_and_what_is_out_of_bounds_is_clipped(modul
         ("words", "needs 2 finite numbers"),
         ("digits", "needs 2 finite numbers"),
         ("imaginary", "needs 2 finite numbers"),
-        ("ragged", "failed when called: ValueError: setting an array element"),
-        ("breaks", r"failed when called: KeyError: 'no such thing' \(policies_\w+\.py:\d+\)$"),
-        ("leaves", r"failed when called: SystemExit: 0 \("),
-        ("presses", r"failed when called: KeyboardInterrupt \("),
+        ("ragged", "setting an array element"),
+        ("breaks", r"when the policy \w+:breaks was called \(policies_\w+\.py:\d+\)$"),
         ("Blind", "observes 'sounds': frame or state"),
-        ("Unmade", "failed when made: ValueError: no weights"),
+        ("Unmade", r"no weights\nwhen the policy \w+:Unmade was made"),
         ("number", "is not callable"),
         ("missing", "cannot be imported"),
     ],
 )
 def test_what_is_no_policy_is_told_in_a_sentence(module, name, message):
-    with pytest.raises(AcwmError, match=message):
+    with pytest.raises((AcwmError, ValueError, KeyError), match=message):
         own(module, name).act(np.zeros((32, 32, 3), np.uint8), None)
 
 
