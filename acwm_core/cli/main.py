@@ -101,10 +101,9 @@ class AcwmGroup(click.Group):
 def _named_if_of_others(words: Sequence[str]) -> AbstractContextManager[None]:
     """Add a note to errors in a command that another package brings."""
     name = next((word for word in words if not word.startswith("-")), None)
-    brought = catalog().registry("command") if name else ()
-    if name is None or name not in brought or brought[name].distribution == "acwm":
+    command = catalog().registry("command").components().get(name) if name else None
+    if command is None or command.distribution == "acwm":
         return contextlib.nullcontext()
-    command = brought[name]
     return noting(f"in {command.part} of plugin {command.plugin!r}", command.target)
 
 

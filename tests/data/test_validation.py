@@ -12,7 +12,7 @@ from square_world import Square
 
 from acwm_core.data.generate import generate
 from acwm_core.data.manifest import MANIFEST
-from acwm_core.errors import AcwmError, PluginError
+from acwm_core.errors import AcwmError, DataError, PluginError
 from acwm_core.plugins import catalog, hookimpl
 
 
