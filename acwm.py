@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from acwm_core.model.world_model import WorldModel
     from acwm_core.plugins import Component
     from acwm_core.recipe import Recipe, compose
-    from acwm_core.training.launch import fit
+    from acwm_core.training.fit import fit
     from acwm_core.training.run import load_run as load
     from acwm_planning.planner import Planner
 
@@ -70,7 +70,7 @@ _HOMES = {
     "build_world_model": "acwm_core.model.build:build_world_model",
     "compose": "acwm_core.recipe:compose",
     "evaluate": "acwm_core.evaluation.evaluate:evaluate_run",
-    "fit": "acwm_core.training.launch:fit",
+    "fit": "acwm_core.training.fit:fit",
     "generate": "acwm_core.data.generate:generate",
     "load": "acwm_core.training.run:load_run",
 }

@@ -2,41 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import time
 from pathlib import Path
 
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, Dataset
-
-LOOK_S = 0.3
-"""For how many seconds the load of the cores is measured."""
-
-
-def wait_without_spinning() -> None:
-    """Let torch's idle threads sleep if other programs use the cores; call before importing torch.
-
-    Spinning is faster on idle cores, but wastes shared ones. If the user has set OMP_WAIT_POLICY or
-    OMP_NUM_THREADS, nothing is changed.
-    """
-    stat = Path("/proc/stat")
-    chosen = {"OMP_WAIT_POLICY", "OMP_NUM_THREADS"} & {*os.environ}
-    if chosen or "torch" in sys.modules or not stat.exists():
-        return
-    own = {f"cpu{core}" for core in os.sched_getaffinity(0)}
-
-    def idle_seconds() -> float:
-        counts = [line.split() for line in stat.read_text(encoding="utf-8").splitlines()]
-        ticks = sum(int(each[4]) + int(each[5]) for each in counts if each[0] in own)
-        return ticks / os.sysconf("SC_CLK_TCK")
-
-    before, started = idle_seconds(), time.monotonic()
-    time.sleep(LOOK_S)
-    busy = len(own) - (idle_seconds() - before) / (time.monotonic() - started)
-    if before and busy > 0.5:
-        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+from acwm_core.training.threads import wait_without_spinning
 
 
 @click.command()
@@ -81,7 +52,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     Dataset("dataset", "card.yaml", make).convert(path, None, None)
 
     wait_without_spinning()
-    from acwm_core.training.launch import fit as train  # last: importing torch takes seconds
+    from acwm_core.training.fit import fit as train  # last: importing torch takes seconds
 
     overlays = "".join(override for override in others if override.startswith("+"))
     run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)

@@ -1,15 +1,16 @@
-"""Callbacks of training: NaN guard, saved weights, CPU time, videos, rollouts, checkpoints."""
+"""Callbacks of training: finite numbers, checkpoints, saved weights, CPU time, videos, rollouts."""
 
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback, Checkpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from PIL import Image
 from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
@@ -21,10 +22,9 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import TrainingError
 from acwm_core.model.shapes import Video
-from acwm_core.training.checkpoints import without_codec
+from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import gradient_norm, total_norm
 from acwm_core.training.run import RunFolder, save_weights
-from acwm_core.training.task import WorldModelTask
 
 MAX_ROLLOUT_STEPS = 4
 """Most sampling steps in validation rollouts, which only show a trend and must be cheap."""
@@ -45,20 +45,11 @@ class NanGuard(Callback):
     def __init__(self, run: RunFolder) -> None:
         self._run = run
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check the weights that training starts from."""
-        assert isinstance(pl_module, WorldModelTask)
-        if not _are_finite(without_codec(pl_module.state_dict()).values()):
-            raise TrainingError(
-                f"{self._run.last_checkpoint} holds weights, or an average of them, that are not "
-                "finite: remove the run and train again"
-            )
-
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
         """Check the gradient; all ranks see the same value and stop together."""
-        assert isinstance(pl_module, WorldModelTask)
+        assert isinstance(pl_module, TrainingModule)
         norm = gradient_norm(pl_module.world_model.parameters())
         pl_module.gradient_norm = norm
         pl_module.log("train/gradient_norm", norm)
@@ -116,7 +107,7 @@ class SavedWeights(Callback):
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Take the weights from the checkpoint; sharded ones are gathered here."""
-        assert isinstance(pl_module, WorldModelTask)
+        assert isinstance(pl_module, TrainingModule)
         weights: dict[str, Tensor] = {}
         for name, value in checkpoint["state_dict"].items():
             if name.startswith("averaged."):
@@ -127,6 +118,31 @@ class SavedWeights(Callback):
             # The codec is frozen, and hashing a large one takes longer than writing the file.
             self._codec = self._codec or pl_module.world_model.codec.fingerprint()
             save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
+
+
+class CpuTime(Callback):
+    """Stores in checkpoints the CPU time of training in seconds, summed over all resumes.
+
+    It is not stored with weights and metrics, which are equal when training is repeated.
+
+    Args:
+        init_from: `all_training` of the run whose weights training started from, which is stored
+            as well, since that run may be gone or another by the time somebody asks.
+    """
+
+    def __init__(self, init_from: dict[str, Any] | None = None) -> None:
+        self._before = -time.process_time()
+        self._init_from = init_from
+
+    def state_dict(self) -> dict[str, Any]:
+        """The CPU time so far, and what training started from."""
+        start = {"init_from": self._init_from} if self._init_from else {}
+        return {"cpu_seconds": self._before + time.process_time(), **start}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Add the CPU time stored in a checkpoint."""
+        self._before += state_dict["cpu_seconds"]
+        self._init_from = state_dict.get("init_from")
 
 
 class SampleVideos(Callback):
@@ -150,7 +166,7 @@ class SampleVideos(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Sample from the averaged weights when it is time."""
-        assert isinstance(pl_module, WorldModelTask)
+        assert isinstance(pl_module, TrainingModule)
         due = stepped(trainer, batch_idx) and trainer.global_step % self._every_n_steps == 0
         if due and (trainer.is_global_zero or pl_module.is_sharded):
             truth = self._video.to(pl_module.device) / 255
@@ -196,7 +212,7 @@ class ValidationRollouts(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Predict this process's share of the clips, and log the result of all processes."""
-        assert isinstance(pl_module, WorldModelTask)
+        assert isinstance(pl_module, TrainingModule)
         own = range(trainer.global_rank, len(self._video), trainer.world_size)
         # Sharded weights are gathered layer by layer, so all processes must predict together.
         shown = [*(range(len(self._video)) if pl_module.is_sharded else own)]
@@ -235,12 +251,32 @@ def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
     return buffer.getvalue()
 
 
+class BestCheckpoint(ModelCheckpoint):
+    """`best.ckpt`, the checkpoint with the least validation loss."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "best", monitor="val/loss", enable_version_counter=False)
+
+    @property
+    def state_key(self) -> str:
+        """That of `ModelCheckpoint`, under which runs have always stored it."""
+        return super().state_key.replace(type(self).__name__, ModelCheckpoint.__name__)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the least loss from a checkpoint, but no path: the folder may have moved."""
+        score, path = state_dict["best_model_score"], f"{self.dirpath}/best.ckpt"
+        if score is not None:
+            self.best_model_score = self.kth_value = score
+            self.best_model_path = self.kth_best_model_path = path
+            self.best_k_models = {path: score}
+
+
 class LastCheckpoint(Checkpoint):
     """Saves `last.ckpt`, from which a run resumes, every few steps and after the last one.
 
-    It always saves in the middle of Lightning's epoch, so that a finished run can be trained
-    further. The file is first written under a temporary name: if the process is killed at any
-    moment, the last checkpoint is intact.
+    Lightning's `ModelCheckpoint` saves before the validation of the same step, which a resumed run
+    then leaves out, and not after the last step. This always saves in the middle of Lightning's
+    epoch, so that a finished run can be trained further.
     """
 
     def __init__(self, path: Path, every_n_steps: int) -> None:

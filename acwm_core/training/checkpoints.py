@@ -9,65 +9,45 @@ from __future__ import annotations
 import io
 import os
 import pickle
-import re
 import shutil
 import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from math import prod
 from pathlib import Path
 from typing import IO, Any, cast
 
 import torch
 import torch.distributed.checkpoint as dcp
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
-from lightning.pytorch.strategies import Strategy
 from torch import Tensor
 from torch.distributed.checkpoint import metadata
 from torch.distributed.checkpoint.api import CheckpointException
-from torch.distributed.checkpoint.filesystem import FileSystemReader, _StorageInfo  # pyright: ignore[reportPrivateUsage]
-from torch.distributed.checkpoint.metadata import Metadata, StorageMeta
-from torch.serialization import _get_layout  # pyright: ignore
+from torch.distributed.checkpoint.filesystem import FileSystemReader
 
-from acwm_core.data.shards import UNREADABLE
 from acwm_core.errors import TrainingError
-from acwm_core.untrusted import read_bytes
 
 META = "meta.pt"
 """File in a folder with everything but the tensors of the model and the optimiser."""
 
+_INDEX = {
+    *("torch.Size", "torch.serialization._get_layout", "pathlib.PosixPath"),
+    "torch.distributed.checkpoint.filesystem._StorageInfo",
+    *(
+        f"torch.distributed.checkpoint.metadata.{name}"
+        for name in (
+            *("Metadata", "TensorStorageMetadata", "TensorProperties", "_MEM_FORMAT_ENCODING"),
+            *("ChunkStorageMetadata", "MetadataIndex", "StorageMeta"),
+        )
+    ),
+}
+"""Names allowed in the index of a folder, beside those of number types."""
+
 WEIGHTS, STATES = "model.", "optimizer."
 """Prefixes of the tensors in a folder."""
 
-_SHARE = re.compile(r"__\d+_\d+\.distcp")
-
-_FORMATS: Any = metadata._MEM_FORMAT_ENCODING  # pyright: ignore[reportPrivateUsage]
-
-
-def _format(owner: Any, name: str) -> Any:
-    """In place of `getattr`, by which Python before 3.11.4 pickles the members of an enum."""
-    if owner is not _FORMATS:
-        raise ValueError(f"it names {name} of {owner}, which is not run")
-    return _FORMATS[name]
-
-
-_INDEX: dict[str, Any] = {"pathlib.PosixPath": type(Path()), "builtins.getattr": _format} | {
-    f"{each.__module__}.{each.__qualname__}": each
-    for each in cast(
-        list[Any],
-        [
-            *(metadata.Metadata, metadata.TensorStorageMetadata, metadata.TensorProperties),
-            *(metadata.ChunkStorageMetadata, metadata.MetadataIndex, metadata.StorageMeta),
-            *(_FORMATS, _StorageInfo, torch.Size, _get_layout, type(Path())),
-        ],
-    )
-}
-"""Types allowed in the index of a folder, beside number types."""
-
 
 def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
-    """A training task's state dict without the frozen codec, which the run's recipe names."""
+    """A training module's state dict without the frozen codec, which the run's recipe names."""
     return {name: value for name, value in state.items() if name.split(".")[1] != "codec"}
 
 
@@ -78,10 +58,27 @@ def last_whole(path: Path) -> Path | None:
 
 def read_details(path: Path) -> dict[str, Any]:
     """The entries of a checkpoint such as ``global_step``, without reading the tensors."""
-    details = _loaded(path / META if path.is_dir() else path, mmap=True)
-    if not isinstance(details.get("global_step"), int):
-        raise _damaged(path, "it does not say its step")
-    return details
+    return _load(path / META if path.is_dir() else path, mmap=True)
+
+
+def read_whole(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of either kind, in the form of Lightning's single files, on the CPU."""
+    return _load(path) if path.is_file() else _read_folder(path)
+
+
+def _load(file: Path, *, mmap: bool = False) -> dict[str, Any]:
+    """The dict in a file of `torch.save`, read without executing anything in it."""
+    try:
+        return torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError) as error:
+        raise _damaged(file, error) from error
+
+
+def _damaged(path: Path, error: BaseException) -> TrainingError:
+    why = " ".join(str(error).split())[:200]
+    return TrainingError(
+        f"{path} is damaged ({why}): restore it from a backup, or remove it and train again"
+    )
 
 
 def check_sums(path: Path) -> None:
@@ -95,14 +92,12 @@ def check_sums(path: Path) -> None:
     try:
         _check_archive(path / META if path.is_dir() else path)
         if path.is_dir():  # every tensor is a separate archive
-            for part in PlainReader(path).read_metadata().storage_data.values():
+            for part in _Reader(path).read_metadata().storage_data.values():
                 with (path / part.relative_path).open("rb") as file:
                     file.seek(part.offset)
                     _check_archive(io.BytesIO(file.read(part.length)))
-    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, *UNREADABLE) as error:
-        raise TrainingError(
-            f"{path} is damaged ({error}): restore it from a backup, or remove it and train again"
-        ) from None
+    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, NotImplementedError) as error:
+        raise _damaged(path, error) from error
 
 
 def _check_archive(file: Path | IO[bytes]) -> None:
@@ -111,23 +106,9 @@ def _check_archive(file: Path | IO[bytes]) -> None:
             raise zipfile.BadZipFile(f"{name} has another checksum than when it was written")
 
 
-def read_whole(path: Path) -> dict[str, Any]:
-    """Read a checkpoint of either kind, in the form of Lightning's single files, on the CPU.
-
-    Raises:
-        TrainingError: it is damaged, or holds more than numbers and text, which is not executed.
-    """
-    if path.is_file():
-        return _loaded(path)
-    try:
-        return _read_folder(path)
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise _damaged(path, f"{type(error).__name__}: {error}") from error
-
-
 def _read_folder(path: Path) -> dict[str, Any]:
     checkpoint = read_details(path)
-    stored = cast(Any, PlainReader(path).read_metadata()).state_dict_metadata
+    stored = cast(Any, _Reader(path).read_metadata()).state_dict_metadata
     tensors = {
         name: torch.empty(kind.size, dtype=kind.properties.dtype) for name, kind in stored.items()
     }
@@ -151,77 +132,58 @@ def _read_folder(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-class PlainReader(FileSystemReader):
-    """Reads a folder that may hold only numbers: its index is unpickled with an allow-list."""
-
-    def read_metadata(self, *args: Any, **kwargs: Any) -> Metadata:
-        """The index of the tensors, which PyTorch itself would unpickle without restrictions.
-
-        Raises:
-            TrainingError: it holds anything but descriptions of tensors in files of the folder.
-        """
-        file = Path(cast(Any, self).path) / ".metadata"
-        try:
-            found: Any = _Index(io.BytesIO(read_bytes(file))).load()
-            places, tensors = found.storage_data, found.state_dict_metadata.values()
-            if not all(_SHARE.fullmatch(place.relative_path) for place in places.values()):
-                raise ValueError("it names files elsewhere")
-            claimed = sum(prod(each.size) * each.properties.dtype.itemsize for each in tensors)
-            if claimed > sum(each.stat().st_size for each in file.parent.iterdir()):
-                raise ValueError(f"it claims {claimed} bytes, more than there are")
-        except Exception as error:  # a forged file can make the parser raise anything
-            raise _damaged(file, f"{type(error).__name__}: {error}") from error
-        found.storage_meta = StorageMeta(load_id=self.load_id)
-        return cast(Metadata, found)
-
-
-class _Index(pickle.Unpickler):
-    """Unpickles the allowed types of a folder's index, and refuses every other name."""
-
-    def find_class(self, module_name: str, global_name: str, /) -> Any:
-        """One of `_INDEX`, or a `torch.dtype`."""
-        found: Any = _INDEX.get(f"{module_name}.{global_name}")
-        if found is None and module_name == "torch":
-            found = getattr(torch, global_name, None)
-            found = found if isinstance(found, torch.dtype) else None
-        if found is None:
-            raise ValueError(f"it names {module_name}.{global_name}, which is not run")
-        return found
-
-
 def read_shares(path: Path, tensors: dict[str, Tensor], *, no_dist: bool = False) -> None:
     """Read this process's shard of a folder into `tensors`, in place.
 
     Raises:
         TrainingError: it is damaged, or of another model.
     """
-    reader = PlainReader(path)
+    reader = _Reader(path)
     reader.read_metadata()  # raise its errors here: PyTorch would wrap them in a long traceback
     try:
         cast(Any, dcp).load(tensors, storage_reader=reader, no_dist=no_dist)
     except CheckpointException as error:
         first = next(iter(error.failures.values()), (error, None))[0]
-        raise _damaged(path, f"{type(first).__name__}: {first}") from error
+        raise _damaged(path, first) from error
 
 
-def _loaded(file: Path, *, mmap: bool = False) -> dict[str, Any]:
-    """The dict in a file of `torch.save`, read without executing anything in it."""
-    try:
-        found: Any = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
-        if not isinstance(found, dict):
-            raise TypeError("it is not a dict")
-    except Exception as error:  # a forged file can make the parsers raise anything
-        raise _damaged(file, f"{type(error).__name__}: {error}") from error
-    return cast(dict[str, Any], found)
+class _Reader(FileSystemReader):
+    """Reads a folder. PyTorch itself would unpickle whatever its index holds."""
+
+    def read_metadata(self, *args: Any, **kwargs: Any) -> metadata.Metadata:
+        """The index of the tensors.
+
+        Raises:
+            TrainingError: it is damaged, or holds more than descriptions of tensors in the folder.
+        """
+        file = Path(cast(Any, self).path) / ".metadata"
+        try:
+            index: metadata.Metadata = _Index(io.BytesIO(file.read_bytes())).load()
+        except (pickle.UnpicklingError, EOFError, LookupError, ValueError, OSError) as error:
+            raise _damaged(file, error) from error
+        files = cast(dict[Any, Any], index.storage_data).values()
+        if any(Path(each.relative_path).name != each.relative_path for each in files):
+            raise TrainingError(f"{file} names files of other folders")
+        index.storage_meta = metadata.StorageMeta(load_id=self.load_id)
+        return index
 
 
-def _damaged(path: Path, why: str) -> TrainingError:
-    short = " ".join(why.split())[:200]
-    return TrainingError(f"the checkpoint {path} cannot be read ({short})")
+class _Index(pickle.Unpickler):
+    """Unpickles what PyTorch writes into the index of a folder, and refuses every other name."""
+
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        """One of `_INDEX`, or a `torch.dtype`."""
+        name = f"{module_name}.{global_name}"
+        if name == "builtins.getattr":  # by which Python before 3.11.4 pickles members of an enum
+            return lambda _, member: metadata._MEM_FORMAT_ENCODING[member]  # pyright: ignore
+        is_type = module_name == "torch" and isinstance(vars(torch).get(global_name), torch.dtype)
+        if name in _INDEX or is_type:
+            return super().find_class(module_name, global_name)
+        raise pickle.UnpicklingError(f"it names {name}, which is not run")
 
 
 def write_folder(
-    path: Path, checkpoint: Mapping[str, Any], optimizer: Mapping[str, Any], strategy: Strategy
+    path: Path, checkpoint: Mapping[str, Any], optimizer: Mapping[str, Any], strategy: Any
 ) -> None:
     """Write a checkpoint together with all other processes, each its shard.
 
@@ -230,7 +192,7 @@ def write_folder(
         checkpoint: Lightning's checkpoint, the same in all processes except for the
             ``state_dict``; its ``optimizer_states`` are left out.
         optimizer: the optimiser's state dict, by parameter names instead of numbers.
-        strategy: strategy of all processes; the first one writes what they have in common.
+        strategy: Lightning's strategy; the first process writes what all have in common.
     """
     partial = path.with_name(f".{path.name}.partial")
     if strategy.is_global_zero:
@@ -247,29 +209,17 @@ def write_folder(
     strategy.barrier()
 
 
-class CheckpointFiles(TorchCheckpointIO):
-    """Checkpoints of training with all weights on each device: written as one file."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
-    ) -> None:
-        """Write the file, and wait until it is on the disk."""
-        path = Path(path)
-        partial = path.with_name(f".{path.name}.partial")
+def write_file(path: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Write a checkpoint as one file, and wait until it is on the disk."""
+    partial = path.with_name(f".{path.name}.partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove(partial)
+    try:
+        _save(partial, checkpoint)
+    except BaseException:
         _remove(partial)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            _save(partial, checkpoint)
-        except BaseException:
-            _remove(partial)
-            raise
-        _put_in_place(partial, path)
-
-    def load_checkpoint(
-        self, path: Any, map_location: Any = None, weights_only: bool | None = None
-    ) -> dict[str, Any]:
-        """Read a checkpoint of either kind."""
-        return read_whole(Path(path))
+        raise
+    _put_in_place(partial, path)
 
 
 def flat(

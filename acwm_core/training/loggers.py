@@ -1,4 +1,4 @@
-"""Logging of training: `metrics.csv`, TensorBoard, a progress bar, and no irrelevant warnings."""
+"""Logging of training: `metrics.csv`, TensorBoard, other loggers, and no irrelevant warnings."""
 
 from __future__ import annotations
 
@@ -7,29 +7,20 @@ import importlib.util
 import logging
 import os
 import threading
-import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as lightning_pytorch
-import torch
-from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from acwm_core.data.atomic import disk_error, written_whole
 from acwm_core.errors import MissingExtraError
-from acwm_core.training.config import LOGGERS
+from acwm_core.training.config import LOGGERS, chosen_loggers
 from acwm_core.training.run import RunFolder
-
-LINE_EVERY_S = 30.0
-"""Seconds between progress lines if the output is no terminal and cannot show a bar."""
 
 IRRELEVANT = (
     r".*does not have many workers.*",  # decoding is cheap or cached; data.workers sets the number
@@ -64,57 +55,47 @@ def silence_irrelevant_warnings() -> None:
     )
 
 
-def build_loggers(run: RunFolder, first_step: int, chosen: Sequence[Any] = ()) -> list[Logger]:
-    """`metrics.csv` and, unless others are chosen, TensorBoard's event files in the run folder.
+def build_loggers(run: RunFolder, flags: Mapping[str, Any], first_step: int) -> list[Logger]:
+    """`metrics.csv`, and the loggers that `trainer.logger` names; TensorBoard if it chooses none.
+
+    Loggers keep their files in the run folder and name their run after it.
 
     Args:
+        flags: the section `trainer` of the recipe.
         first_step: 0, or the step from which a run resumes; entries of an earlier process from
-            this step on are dropped from both.
-        chosen: the result of `chosen_loggers`.
-    """
-    if chosen and "tensorboard" not in chosen:
-        return [MetricsFile(run.metrics, first_step)]
-    board = TensorBoardLogger(
-        run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
-    )
-    return [MetricsFile(run.metrics, first_step), board]
-
-
-def classes_of_loggers(chosen: Sequence[Any], run: RunFolder) -> list[Any]:
-    """Chosen loggers of Lightning, in the form it takes: `class_path` and `init_args`.
-
-    Loggers chosen by name keep their files in the run folder and name their run after it.
+            this step on are dropped.
 
     Raises:
         MissingExtraError: the package of a logger chosen by name is not installed.
     """
+    chosen = chosen_loggers(flags)
+    loggers: list[Logger] = [MetricsFile(run.metrics, first_step)]
+    if not chosen or "tensorboard" in chosen:
+        board = lightning_loggers.TensorBoardLogger(
+            run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
+        )
+        loggers.append(board)
     place, name = run.path.resolve(), run.path.resolve().name
     project = os.environ.get("WANDB_PROJECT", "acwm")
     experiment = os.environ.get("MLFLOW_EXPERIMENT_NAME", "acwm")
-    presets: dict[str, dict[str, str]] = {
+    settings: dict[str, dict[str, Any]] = {
         "wandb": {"save_dir": f"{place}", "name": name, "project": project},
         "mlflow": {"save_dir": f"{place}/mlruns", "run_name": name, "experiment_name": experiment},
     }
-    for each in presets.keys() & {*filter(lambda one: isinstance(one, str), chosen)}:
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 prefers a server
+    for each in [each for each in chosen if isinstance(each, str) and each in settings]:
         if importlib.util.find_spec(each) is None:
             install = f"pip install 'acwm[{each}]'"
             raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
-    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 prefers a server
-    return [
-        {"class_path": f"lightning.pytorch.loggers.{LOGGERS[each]}", "init_args": presets[each]}
-        if isinstance(each, str)
-        else each
-        for each in chosen
-        if each not in ("csv", "tensorboard")
-    ]
+        loggers.append(getattr(lightning_loggers, LOGGERS[each])(**settings[each]))
+    return loggers
 
 
 class MetricsFile(Logger):
     """Appends each set of logged numbers as a row of a CSV file.
 
     The columns are `step` (number of optimiser steps done before) and one per metric; metrics not
-    logged in a row are left empty. Lightning's own CSVLogger empties the file when a run is
-    resumed.
+    logged in a row are left empty. Lightning's `CSVLogger` empties the file when a run is resumed.
 
     Args:
         first_step: rows from this step on are dropped first, because a resumed run repeats them.
@@ -123,7 +104,7 @@ class MetricsFile(Logger):
     def __init__(self, path: Path, first_step: int = 0) -> None:
         super().__init__()
         self._path, self._first_step = path, first_step
-        self._columns = dict[str, None]()
+        self._columns: list[str] = []
 
     @property
     def name(self) -> str:
@@ -132,7 +113,7 @@ class MetricsFile(Logger):
 
     @property
     def version(self) -> str:
-        """Not used: the file has one fixed place."""
+        """Not used."""
         return ""
 
     @rank_zero_only
@@ -145,102 +126,24 @@ class MetricsFile(Logger):
         row = {"step": step, **{k: repr(float(v)) for k, v in metrics.items() if k != "epoch"}}
         if len(row) == 1:
             return
-        if not row.keys() <= self._columns.keys():
+        if not row.keys() <= {*self._columns}:
             self._add_columns(row)
         with self._path.open("a", newline="") as file:
             csv.DictWriter(file, self._columns).writerow(row)
 
-    def _add_columns(self, row: Mapping[str, Any]) -> None:
-        rows: list[dict[str, str]] = []
-        if self._path.exists():
-            with self._path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        if not self._columns:
-            whole = (old for old in rows if (old["step"] or "").isdecimal())  # complete rows only
-            rows = [old for old in whole if int(old["step"]) < self._first_step]
-            self._columns = dict.fromkeys(rows[0] if rows else ())
-        self._columns |= dict.fromkeys(row)
-        with written_whole(self._path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._columns, restval="")
-            writer.writeheader()
-            writer.writerows(rows)
+    def _add_columns(self, row: Iterable[str]) -> None:
+        """Write the file again, row by row, with columns for all of `row`."""
+        is_resumed = not self._columns and self._first_step > 0 and self._path.exists()
+        old = self._path if self._columns or is_resumed else Path(os.devnull)
+        with old.open(newline="") as before, written_whole(self._path) as partial:
+            rows = csv.DictReader(before)
+            self._columns = [*dict.fromkeys([*(rows.fieldnames or ()), *row])]
+            with partial.open("w", newline="") as after:
+                writer = csv.DictWriter(after, self._columns, restval="")
+                writer.writeheader()
+                writer.writerows(each for each in rows if not is_resumed or self._is_before(each))
 
-
-class StepProgress(ProgressBar):
-    """Shows steps, losses, steps per second and the time left; plain lines in a file or pipe.
-
-    Lightning's own bars count batches of an epoch, which never ends here, and flood log files.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._console = Console(stderr=True)
-        self._bar = Progress(disable=True)
-        self._started_at = self._printed_at = 0.0
-        self._first_step = 0
-
-    def disable(self) -> None:
-        """Show nothing (used on all ranks but the first)."""
-        self._console.quiet = True
-
-    def enable(self) -> None:
-        """Show output again."""
-        self._console.quiet = False
-
-    def print(self, *args: Any, **kwargs: Any) -> None:
-        """Print above the bar."""
-        self._console.print(*args, highlight=False, soft_wrap=True)
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the bar at the step where training starts or resumes."""
-        self._started_at = self._printed_at = time.monotonic()
-        self._first_step = trainer.global_step
-        trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
-        device = trainer.strategy.root_device.type
-        threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
-        step = f" from step {trainer.global_step}" if trainer.global_step else ""
-        self.print(
-            f"training {trained / 1e6:.2f} M parameters on {trainer.world_size} × {device}{threads}"
-            f"{step} in {trainer.precision}"
-        )
-        text = "{task.completed}/{task.total} steps  {task.fields[numbers]}"
-        columns = (TextColumn("training"), BarColumn(), TextColumn(text), TimeRemainingColumn())
-        hidden = self._console.quiet or not self._console.is_terminal
-        self._bar = Progress(*columns, console=self._console, disable=hidden)
-        total = trainer.max_steps if trainer.max_steps > 0 else None
-        self._bar.add_task("training", total=total, completed=trainer.global_step, numbers="")
-        self._bar.start()
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Advance."""
-        if not self._bar.disable:
-            numbers = self._numbers(trainer, pl_module)
-            self._bar.update(self._bar.task_ids[0], completed=trainer.global_step, numbers=numbers)
-        elif time.monotonic() - self._printed_at > LINE_EVERY_S:
-            self._print_line(trainer, pl_module)
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave the finished bar on the screen."""
-        if self._bar.disable:
-            self._print_line(trainer, pl_module)
-        self._bar.stop()
-
-    def on_exception(
-        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
-    ) -> None:
-        """Stop the bar so that the terminal is usable again."""
-        self._bar.stop()
-
-    def _print_line(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._printed_at = time.monotonic()
-        of = f"/{trainer.max_steps}" if trainer.max_steps > 0 else ""
-        self.print(f"step {trainer.global_step}{of}  {self._numbers(trainer, pl_module)}")
-
-    def _numbers(self, trainer: Trainer, pl_module: LightningModule) -> str:
-        elapsed = max(time.monotonic() - self._started_at, 1e-9)
-        rate = (trainer.global_step - self._first_step) / elapsed
-        metrics = self.get_metrics(trainer, pl_module)
-        losses = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
-        return "  ".join([*losses, f"{rate:.3g} steps/s"])
+    def _is_before(self, row: Mapping[str, str | None]) -> bool:
+        """Whether a row is complete, and of a step before the first one."""
+        step = row["step"] or ""
+        return step.isdecimal() and int(step) < self._first_step

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -23,36 +21,14 @@ from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
+from acwm_core.training.checkpoints import read_details
 from acwm_core.training.trained import find_run, trained_models
-from acwm_core.untrusted import check_folder, parse_json, typed
 
 FORMAT = 1
 """Version of the metadata of `model.safetensors`."""
 
 TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
-
-
-@dataclass(frozen=True)
-class _Training:
-    """What is known of a training; the fields are those of `acwm_core.training.effort.CpuTime`."""
-
-    step: int
-    cpu_seconds: float = 0.0
-    name: str = ""
-    init_from: _Training | None = None
-
-    def __post_init__(self) -> None:
-        if not (self.step >= 0 and 0 <= self.cpu_seconds < math.inf):
-            raise ValueError("its step or cpu_seconds is no count")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Facts(_Training):
-    """The metadata of `model.safetensors`."""
-
-    format: int
-    codec: str | None
 
 
 class RunFolder:
@@ -106,7 +82,6 @@ def load_run(path: Path | str) -> RunBundle:
             f"{folder.path} has no trained weights yet: its training stopped before the first "
             "checkpoint"
         )
-    check_folder(folder.path)
     recipe = Recipe.from_yaml(folder.recipe)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)
@@ -151,16 +126,12 @@ def read_metadata(path: Path) -> dict[str, Any]:
     try:
         with cast(Any, safetensors.safe_open)(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
-    except (OSError, safetensors.SafetensorError) as error:
+        facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
-    try:
-        facts: dict[str, Any] = parse_json(metadata.get("acwm", "{}"))
-        if typed(facts, _Facts).format == FORMAT:
-            return facts
-        why = f"its format is not {FORMAT}"
-    except ValueError as error:
-        why = str(error)
-    raise TrainingError(f"{path} was not written by this version of acwm ({why})")
+    if facts.get("format") != FORMAT:
+        raise TrainingError(f"{path} was not written by this version of acwm")
+    return facts
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:
@@ -195,3 +166,28 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     with torch.no_grad():
         for name, value in expected.items():
             value.copy_(weights[name])
+
+
+def training_of(run: RunFolder) -> dict[str, Any]:
+    """How much training is behind a run: ``cpu_seconds`` and, if there was one, ``init_from``.
+
+    It is empty for a folder without checkpoints; the weights of a trained model hold it instead.
+    """
+    if not run.last_checkpoint.exists():
+        return {}
+    return read_details(run.last_checkpoint).get("callbacks", {}).get("CpuTime", {})
+
+
+def all_training(name: str, run: RunFolder) -> dict[str, Any]:
+    """Sum of all training behind the weights of a run, those it started from included.
+
+    Args:
+        name: what the user calls the run; only its last part is kept.
+
+    Returns:
+        ``name``, ``step`` and ``cpu_seconds``.
+    """
+    facts = read_metadata(run.weights) | training_of(run)
+    earlier: dict[str, Any] = facts.get("init_from") or {}
+    sums = {each: facts.get(each, 0) + earlier.get(each, 0) for each in ("step", "cpu_seconds")}
+    return {"name": Path(name).name, **sums}

@@ -1,10 +1,14 @@
-"""`trainer.strategy=fsdp`: each device keeps a shard of weights, average and optimiser states."""
+"""What Lightning's Trainer writes checkpoints with: single files, or folders of shards.
+
+With `trainer.strategy=fsdp` each device keeps a shard of weights, average and optimiser states.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, cast
 
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.strategies import ModelParallelStrategy
 from torch import nn
@@ -23,14 +27,31 @@ from acwm_core.training.checkpoints import (
     read_shares,
     read_whole,
     without_codec,
+    write_file,
     write_folder,
 )
+
+
+class CheckpointFiles(TorchCheckpointIO):
+    """Checkpoints of training with all weights on each device: written as one file."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        """Write the file."""
+        write_file(Path(path), checkpoint)
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read a checkpoint of either kind."""
+        return read_whole(Path(path))
 
 
 class ShardedStrategy(ModelParallelStrategy):
     """Fully sharded data parallel training by PyTorch's `fully_shard` (FSDP2).
 
-    Zhao et al. 2023, arXiv 2304.11277. `WorldModelTask.configure_model` does the sharding.
+    Zhao et al. 2023, arXiv 2304.11277. `TrainingModule.configure_model` does the sharding.
     Checkpoints are folders to which each process writes its shard. Any number of processes, sharded
     or not, can read them.
     """

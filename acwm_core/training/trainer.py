@@ -23,9 +23,8 @@ from lightning.pytorch.strategies import (
 
 from acwm_core.data.encoding import cpu_has_fast_bfloat16
 from acwm_core.errors import RecipeError, TrainingError
-from acwm_core.training.checkpoints import CheckpointFiles
-from acwm_core.training.config import TrainingConfig
-from acwm_core.training.sharding import ShardedStrategy
+from acwm_core.training.config import TrainingConfig, chosen_loggers
+from acwm_core.training.sharding import CheckpointFiles, ShardedStrategy
 
 
 def build_trainer(
@@ -44,6 +43,9 @@ def build_trainer(
         RecipeError: an unknown flag, a value of the wrong type, or a class that cannot be created.
         TrainingError: flags that this training does not support.
     """
+    if not isinstance(flags.get("logger"), bool | None):  # names are among `loggers`
+        others = [each for each in chosen_loggers(flags) if not isinstance(each, str)]
+        flags = {**flags, "logger": others}
     chosen = instantiate_flags(flags)
     _check_flags(chosen, config)
     accumulated = chosen.get("accumulate_grad_batches", 1)

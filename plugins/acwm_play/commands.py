@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from acwm_core.cli.arguments import FOLDER, OUT_FOLDER, RUN, size
-from acwm_core.cli.fit import wait_without_spinning
 from acwm_core.errors import RecipeError
+from acwm_core.training.threads import wait_without_spinning
 
 
 @click.command()

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER
-from acwm_core.cli.fit import wait_without_spinning
 from acwm_core.plugins import catalog
+from acwm_core.training.threads import wait_without_spinning
 from acwm_report.terminal import print_summary
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool
 
 def _fit(recipe: Recipe, run: Path) -> bool:
     wait_without_spinning()
-    from acwm_core.training.launch import fit
+    from acwm_core.training.fit import fit
     from acwm_core.training.run import RunFolder, read_metadata
 
     folder = RunFolder(run)

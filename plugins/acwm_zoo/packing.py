@@ -18,8 +18,7 @@ from acwm_core.evaluation.clip_results import EPISODES
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.recipe import Recipe
-from acwm_core.training.effort import training_of
-from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
+from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights, training_of
 from acwm_zoo.model_card import model_card
 
 MAX_BYTES = 8_000_000

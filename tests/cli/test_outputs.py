@@ -24,7 +24,7 @@ WORKING = {
     "compare": "acwm_report.comparison.compare_runs",
     "leaderboard": "acwm_report.leaderboard.write_leaderboard",
     "rollout": "acwm_dream.rollout.rollout_run",
-    "fit": "acwm_core.training.launch.fit",
+    "fit": "acwm_core.training.fit.fit",
     "generate": "acwm_core.data.generate.generate",
     "experiment": "acwm_experiment.runner.run_experiment",
     "jobs of an experiment": "acwm_experiment.runner.submit_experiment",

@@ -14,7 +14,7 @@ from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.errors import TrainingError
 from acwm_core.plugins import catalog
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run, read_metadata
 from acwm_zoo.importing import import_checkpoint
 from tests.codecs.tiny_autoencoders import original_state, tiny_wan

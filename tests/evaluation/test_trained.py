@@ -6,7 +6,7 @@ import torch
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import rollout_run
 from tests.evaluation import tiny

@@ -43,7 +43,7 @@ def run(path, *words):
 def serve(path):
     """Fork for every connection; single-threaded, as forks of threads would be unsafe."""
     import acwm_core.evaluation.evaluate
-    import acwm_core.training.launch  # noqa: F401
+    import acwm_core.training.fit  # noqa: F401
     from acwm_core.plugins import catalog
     from acwm_experiment import commands
     from tests.experiment.parts import Plugin

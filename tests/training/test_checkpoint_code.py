@@ -11,7 +11,7 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_details, read_shares, read_whole, write_folder
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from tests.training.tiny import tiny_recipe
 
 FORMATS = dcp.metadata._MEM_FORMAT_ENCODING
@@ -120,19 +120,14 @@ def test_pickled_bytes_among_the_tensors(tmp_path):
     assert not mark.exists()
 
 
-def test_shares_elsewhere_and_tensors_without_end(tmp_path):
+def test_shards_in_other_folders_are_refused(tmp_path):
     path = folder(tmp_path / "last.ckpt")
     found = index(path)
     for place in found.storage_data.values():
         place.relative_path = "../../secret"
     (path / ".metadata").write_bytes(pickle.dumps(found))
-    with pytest.raises(TrainingError, match="files elsewhere"):
+    with pytest.raises(TrainingError, match="files of other folders"):
         read(path)
-    found = index(folder(tmp_path / "other.ckpt"))
-    found.state_dict_metadata["model.w.model.a"].size = torch.Size([10**9, 10**3])
-    (tmp_path / "other.ckpt" / ".metadata").write_bytes(pickle.dumps(found))
-    with pytest.raises(TrainingError, match="more than there are"):
-        read(tmp_path / "other.ckpt")
 
 
 @pytest.mark.parametrize("resume", ["auto", "run"])

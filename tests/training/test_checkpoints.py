@@ -12,16 +12,16 @@ from torch.distributed.checkpoint.api import CheckpointException
 from acwm_core.errors import TrainingError
 from acwm_core.training import checkpoints
 from acwm_core.training.checkpoints import (
-    CheckpointFiles,
     check_sums,
     last_whole,
     read_details,
     read_whole,
+    write_file,
     write_folder,
 )
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.module import TrainingModule
 from acwm_core.training.sharding import ShardedStrategy
-from acwm_core.training.task import WorldModelTask
 from tests.training.tiny import tiny_world_model
 
 
@@ -34,7 +34,7 @@ def write(kind: str, path: Path, step: int) -> None:
     value = torch.full((3,), float(step))
     checkpoint = {"global_step": step, "state_dict": {"world_model.weight": value}}
     if kind == "file":
-        CheckpointFiles().save_checkpoint(checkpoint, path)
+        write_file(path, checkpoint)
     else:
         groups = [{"lr": 0.1, "params": ["world_model.weight"]}]
         optimizer = {"state": {}, "param_groups": groups}
@@ -101,7 +101,7 @@ def test_every_byte_that_was_changed_is_found(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_sharded_training_refuses_weights_that_lack_any(kind, tmp_path, monkeypatch):
-    task = WorldModelTask(tiny_world_model(), TrainingConfig())
+    task = TrainingModule(tiny_world_model(), TrainingConfig())
     strategy = ShardedStrategy()
     strategy.model = task
     strategy.optimizers = [torch.optim.AdamW(task.world_model.model.parameters())]

@@ -11,7 +11,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-import torch
 from safetensors.torch import load_file, save_file
 
 from acwm_core.data.atomic import held
@@ -20,7 +19,7 @@ from acwm_core.data.loader import ResumableLoader
 from acwm_core.errors import AcwmError, DataError, TrainingError
 from acwm_core.plugins import catalog
 from acwm_core.training.checkpoints import read_details
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.plugins import plugin_of
 from tests.training.test_fit import killable, killed_run, weights
@@ -53,17 +52,6 @@ def test_a_validation_that_is_not_finite_stops_the_run(data, tmp_path):
     recipe = tiny_recipe(data, trainer={"callbacks": [spoil]}, training=often)
     with pytest.raises(TrainingError, match=r"val/loss is not finite in step 8 \(nothing was"):
         fit(recipe, tmp_path / "run")
-
-
-def test_a_checkpoint_of_old_with_nan_in_its_average_is_refused(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(Kill, "batch", 5)
-    run = killed_run(data, tmp_path / "run", monkeypatch)
-    checkpoint = torch.load(run.last_checkpoint, weights_only=True)
-    name = next(name for name in checkpoint["state_dict"] if name.startswith("averaged."))
-    checkpoint["state_dict"][name].view(-1)[0] = torch.nan
-    torch.save(checkpoint, run.last_checkpoint)
-    with pytest.raises(TrainingError, match=r"last\.ckpt holds weights.* not finite"):
-        fit(killable(data), "", resume=run.path)
 
 
 def test_a_run_that_another_command_trains_is_not_judged_by_its_files(data, tmp_path, monkeypatch):
@@ -169,7 +157,7 @@ class Detached(TinyModel):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Broadcast", r"forward gives Tensor \[4, 1, 3, 2, 2\].* not the shape \[4, 5, 3, 2, 2\]"),
+        ("Broadcast", r"4, 1, 3, 2, 2.*4, 5, 3, 2, 2"),
         ("Detached", "the loss of Detached has no gradient"),
     ],
 )

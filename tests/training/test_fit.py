@@ -13,10 +13,10 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.episodes import ClipDataset, EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
-from acwm_core.training.effort import CpuTime
-from acwm_core.training.launch import fit
+from acwm_core.training.callbacks import CpuTime
+from acwm_core.training.fit import fit
+from acwm_core.training.module import VALIDATION_NOISE, generator_of
 from acwm_core.training.run import RunFolder, load_run, read_metadata
-from acwm_core.training.task import VALIDATION_NOISE, generator_of
 from acwm_core.training.trainer import automatic_precision
 from acwm_metrics.torchmetrics import as_torchmetric
 from tests.training.tiny import Kill, Killed, tiny_recipe

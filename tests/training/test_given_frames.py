@@ -8,7 +8,7 @@ import torch
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.errors import RecipeError
 from acwm_core.model.world_model import WorldModel
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
 from tests.training.test_fit import numbers
 from tests.training.test_short_episodes import short  # noqa: F401 - a fixture

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from acwm_core.errors import TrainingError
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
 from tests.training.test_fit import assert_same, killable, killed_run
 from tests.training.tiny import Kill, tiny_recipe

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from acwm_core.errors import TrainingError
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.layers import layers_of, recompute_activations
 from acwm_core.training.run import RunFolder
 from tests.training.test_fit import weights

@@ -7,7 +7,7 @@ import pytest
 
 from acwm_core.errors import MissingExtraError, RecipeError
 from acwm_core.recipe import Recipe
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
 from tests.training.tiny import tiny_recipe
 

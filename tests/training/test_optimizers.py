@@ -11,7 +11,8 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 
 from acwm_core.errors import RecipeError
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
+from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import (
     JoinedOptimizer,
     averaged_copy,
@@ -22,7 +23,6 @@ from acwm_core.training.optimizers import (
     parameter_groups,
 )
 from acwm_core.training.run import RunFolder
-from acwm_core.training.task import WorldModelTask
 from tests.training.test_fit import numbers
 from tests.training.tiny import tiny_recipe, tiny_world_model
 
@@ -166,7 +166,7 @@ def test_decay_starts_where_it_is_told_and_would_end_at_zero(schedule):
 
 @pytest.mark.parametrize("algorithm", ["norm", "value"])
 def test_the_flags_choose_the_clipping(algorithm):
-    task = WorldModelTask(tiny_world_model(), TrainingConfig())
+    task = TrainingModule(tiny_world_model(), TrainingConfig())
     weight = task.world_model.model.enter.weight
     weight.grad = torch.full_like(weight, 3.0)
     task.gradient_norm = weight.grad.norm()  # as the guard measures it

@@ -7,9 +7,9 @@ import stat
 import pytest
 
 from acwm_core.errors import TrainingError
-from acwm_core.training.launch import fit
-from acwm_core.training.preemption import SIGNALS, StoppedEarly
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.signals import SIGNALS, StoppedEarly
 from tests.training.test_fit import assert_same, numbers
 from tests.training.tiny import tiny_recipe
 
@@ -176,7 +176,7 @@ def test_a_run_that_never_saved_starts_again(whole, data, tmp_path, again, monke
         os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr("acwm_core.training.data_module.encode_windows", interrupted)
+        patch.setattr("acwm_core.training.data.encode_windows", interrupted)
         with pytest.raises(
             StoppedEarly, match="before the first step; start again with resume=auto"
         ):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.training.test_fit import assert_same, numbers
 from tests.training.tiny import tiny_recipe

@@ -12,8 +12,8 @@ from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.training.data_module import ClipData
-from acwm_core.training.launch import fit
+from acwm_core.training.data import ClipData
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, read_metadata
 from tests.training.test_fit import assert_same
 from tests.training.test_processes import TWO, train
@@ -98,7 +98,7 @@ def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
 def test_steps_of_another_size_are_refused(shards):
     """They would go on with the very next clip, but not on the same loss curve."""
     config = DataConfig(str(shards), clip_frames=9, batch_size=4)
-    data = ClipData(config, TinyCodec(), 0)
+    data = ClipData(config, EpisodeDataset(shards, "train"), TinyCodec(), 0)
     data.trainer = SimpleNamespace(world_size=2, accumulate_grad_batches=1)
     with pytest.raises(TrainingError, match=r"takes 24 clips, but .* make 8: .* product is 24"):
         data.load_state_dict({"clips_per_step": 24})
@@ -131,7 +131,8 @@ def test_damage_that_one_rank_meets_ends_all_with_its_name(shards, tmp_path):
 @pytest.mark.parametrize("fraction", [1.0, 0.5])
 def test_a_fraction_of_the_data_leaves_validation_alone(shards, fraction):
     chosen = {"clip_frames": 9, "validation_episodes": 2, "fraction": fraction}
-    data = ClipData(DataConfig(str(shards), **VIDEO, **chosen), TinyCodec(), 0)
+    config = DataConfig(str(shards), **VIDEO, **chosen)
+    data = ClipData(config, EpisodeDataset(shards, "train"), TinyCodec(), 0)
     data.setup("fit")
     training = {*data._train.windows[:, 0].tolist()}
     assert len(training) == 6 * fraction

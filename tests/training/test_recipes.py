@@ -9,7 +9,7 @@ import pytest
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from acwm_core.recipe.compose import recipe_names
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_formats.arrays import Recording, write_dataset
 
 SMALL = ("small", "push_cube_small")

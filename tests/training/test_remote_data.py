@@ -3,7 +3,7 @@
 import pytest
 
 from acwm_core.data import remote
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
 from tests.training.test_fit import assert_same
 from tests.training.tiny import tiny_recipe

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from acwm_core.data.clips import DataConfig
+from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
-from acwm_core.training.data_module import ClipData
-from acwm_core.training.launch import fit
+from acwm_core.training.data import ClipData
+from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
@@ -53,7 +54,7 @@ def test_no_batch_is_filled_up(short, seen, tmp_path, cached):
 
 def test_rollouts_and_samples_use_several_held_out_episodes(short, tiny_parts):
     config = DataConfig(path=str(short), clip_frames=9, validation_episodes=6)
-    data = ClipData(config, TinyCodec(), seed=0)
+    data = ClipData(config, EpisodeDataset(short, "train"), TinyCodec(), seed=0)
     video, actions = data.sample(3)  # of episodes of 6, 9, 8, 5, 9 and 6 frames
     assert video.shape[:2] == actions.shape[:2] == (3, 7)
     assert data.sample(0)[0].shape[0] == 0

@@ -8,8 +8,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.module import TrainingModule, generator_of, seed_of
 from acwm_core.training.optimizers import parameter_groups
-from acwm_core.training.task import WorldModelTask, generator_of, seed_of
 from tests.training.tiny import tiny_world_model
 
 
@@ -21,7 +21,7 @@ def test_noise_depends_on_every_part_of_its_key_and_on_nothing_else():
 
 
 def test_video_batches_are_latents_of_their_codec():
-    task = WorldModelTask(tiny_world_model(), TrainingConfig())
+    task = TrainingModule(tiny_world_model(), TrainingConfig())
     video = torch.randint(0, 256, (2, 9, 3, 16, 16), dtype=torch.uint8)
     expected = task.world_model.codec.encode(video.float() / 255)
     assert torch.equal(task.latents({"video": video}), expected)
@@ -30,7 +30,7 @@ def test_video_batches_are_latents_of_their_codec():
 
 def parts_seen(steps, monkeypatch, **training):
     """First and last latent frame of 28 that reach the loss in some of 100 steps."""
-    task = WorldModelTask(tiny_world_model(), TrainingConfig(**training))
+    task = TrainingModule(tiny_world_model(), TrainingConfig(**training))
     codec = task.world_model.codec
     stride, seen = codec.temporal_stride, []
     monkeypatch.setattr(
@@ -101,7 +101,7 @@ class Recorder(L.Callback):
 @pytest.mark.parametrize("accumulated", [1, 2])
 def test_training_averages_once_per_optimiser_step(accumulated, tmp_path):
     """Against eₙ = dₙ·eₙ₋₁ + (1 − dₙ)·wₙ with dₙ = min(d, (1 + n)/(10 + n)), in float64."""
-    task = WorldModelTask(tiny_world_model(), TrainingConfig(learning_rate=1e-2, ema_decay=0.4))
+    task = TrainingModule(tiny_world_model(), TrainingConfig(learning_rate=1e-2, ema_decay=0.4))
     recorder = Recorder()
     trainer = L.Trainer(
         max_steps=5,
@@ -153,10 +153,10 @@ def test_decay_spares_vectors_and_embeddings():
 
 
 def test_checkpoints_without_the_codec_load_and_others_do_not():
-    task = WorldModelTask(tiny_world_model(seed=1), TrainingConfig())
+    task = TrainingModule(tiny_world_model(seed=1), TrainingConfig())
     checkpoint = {"state_dict": task.state_dict()}
     task.on_save_checkpoint(checkpoint)
-    other = WorldModelTask(tiny_world_model(seed=2), TrainingConfig())
+    other = TrainingModule(tiny_world_model(seed=2), TrainingConfig())
     other.load_state_dict(checkpoint["state_dict"])
     assert torch.equal(other.world_model.model.enter.weight, task.world_model.model.enter.weight)
     del checkpoint["state_dict"]["averaged.model.enter.weight"]

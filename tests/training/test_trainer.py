@@ -12,10 +12,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.callbacks import LastCheckpoint, NanGuard
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.loggers import StepProgress
+from acwm_core.training.module import TrainingModule
+from acwm_core.training.progress import StepProgress
 from acwm_core.training.run import RunFolder
 from acwm_core.training.sharding import ShardedStrategy
-from acwm_core.training.task import WorldModelTask
 from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
 from tests.training.tiny import tiny_world_model
 
@@ -123,7 +123,7 @@ def test_precision_follows_the_hardware(cuda, amx, avx, accelerator, expected, m
 def test_with_a_gradient_scaler_only_the_loss_must_be_finite(tmp_path):
     """In 16-mixed the scaler skips steps whose gradients overflow; that is no reason to stop."""
     guard = NanGuard(RunFolder(tmp_path))
-    module = WorldModelTask(tiny_world_model(), TrainingConfig())
+    module = TrainingModule(tiny_world_model(), TrainingConfig())
     weight = module.world_model.model.enter.weight
     weight.grad = torch.full_like(weight, float("inf"))
     module.log = lambda *_: None

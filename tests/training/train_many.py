@@ -11,7 +11,7 @@ import sys
 
 from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from tests.training.tiny import TinyPlugin, tiny_recipe
 
 

@@ -13,8 +13,9 @@ from acwm_core.data import atomic
 from acwm_core.data.atomic import alone, held, made_whole
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.plugins import catalog
-from acwm_core.training import launch, trained
-from acwm_core.training.launch import fit
+from acwm_core.training import fit as fitting
+from acwm_core.training import trained
+from acwm_core.training.fit import fit
 from acwm_planning.resumable import ResumableResults
 from tests.experiment import parts as experiment
 from tests.folders import checksums
@@ -94,19 +95,19 @@ def test_a_run_that_another_trained_since_it_was_looked_at_is_left(
     data, tmp_path, monkeypatch, resumes
 ):
     """Both looked at the folder before either held it; the first has ended in the meantime."""
-    folder, usual = tmp_path / "run", launch._callbacks
+    folder, usual = tmp_path / "run", fitting._callbacks
     if resumes:
         fit(recipe(data), folder)
     longer = training.tiny_recipe(data, trainer={"max_steps": 4})
     resume = folder if resumes else None
 
     def overtaken(*given):
-        monkeypatch.setattr(launch, "_callbacks", usual)
+        monkeypatch.setattr(fitting, "_callbacks", usual)
         fit(longer, folder, resume=resume)
         overtaken.found = checksums(folder)
         return usual(*given)
 
-    monkeypatch.setattr(launch, "_callbacks", overtaken)
+    monkeypatch.setattr(fitting, "_callbacks", overtaken)
     with pytest.raises(TrainingError, match=r"another command has trained .* meanwhile"):
         fit(longer, folder, resume=resume)
     assert checksums(folder) == overtaken.found

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from acwm_core.recipe import Recipe
-from acwm_core.training.launch import fit
+from acwm_core.training.fit import fit
 from tests.evaluation import tiny
 from tests.evaluation.test_given_frames import QUICK
 

@@ -17,9 +17,8 @@ from acwm_core.errors import TrainingError
 from acwm_core.evaluation.results import Summary
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
-from acwm_core.training.effort import all_training
-from acwm_core.training.launch import fit
-from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights
+from acwm_core.training.fit import fit
+from acwm_core.training.run import RunFolder, all_training, load_run, read_metadata, save_weights
 from acwm_zoo import packing
 from acwm_zoo.packing import pack
 from tests.evaluation import tiny

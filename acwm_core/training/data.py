@@ -42,15 +42,13 @@ class ClipData(L.LightningDataModule):
 
     Args:
         codec: frozen; encodes the clips once if the recipe caches latents.
-
-    Raises:
-        DataError: there is no such data, or it is unfinished or damaged.
     """
 
-    def __init__(self, config: DataConfig, codec: Codec, seed: int) -> None:
+    def __init__(
+        self, config: DataConfig, episodes: EpisodeDataset, codec: Codec, seed: int
+    ) -> None:
         super().__init__()
-        self.config, self.codec, self.seed = config, codec, seed
-        self.episodes = EpisodeDataset(config.path, "train")
+        self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start

@@ -8,7 +8,6 @@ from typing import Any, cast
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
@@ -28,7 +27,6 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
-from acwm_core.training.restoring import check_moments, keep_own_files
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 """Separate random streams, so that validation never repeats the noise of a training step."""
@@ -42,7 +40,7 @@ Batch = Mapping[str, Any]
 clips' places in the stream; or ``"video"``, uint8 `[B, T, 3, H, W]`, instead of the latents."""
 
 
-class WorldModelTask(L.LightningModule):
+class TrainingModule(L.LightningModule):
     """Trains the model and conditioner of a world model; its codec stays frozen.
 
     The randomness of a clip is a pure function of the seed and the clip's place in the stream of
@@ -58,7 +56,6 @@ class WorldModelTask(L.LightningModule):
         is_sharded: whether the weights are sharded over the devices, so that all must compute
             together.
         gradient_norm: gradient norm of the current step before clipping; set by `NanGuard`.
-        has_stepped: whether a step was completed since training began or was resumed.
     """
 
     def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
@@ -68,7 +65,6 @@ class WorldModelTask(L.LightningModule):
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
         self.gradient_norm: Tensor | None = None
-        self.has_stepped = False
         self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
@@ -89,21 +85,19 @@ class WorldModelTask(L.LightningModule):
                 shard(world_model, mesh["data_parallel"])
             self.is_sharded = True
 
-    def on_train_start(self) -> None:
-        """Check the optimiser states that a checkpoint may have restored."""
-        for optimizer in self.trainer.optimizers:
-            check_moments(optimizer)
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Flow-matching loss of one batch."""
-        self.has_stepped = self.gradient_norm is not None  # then the schedule has stepped, too
+        """The loss of one batch."""
         keys = [(self.config.seed, TRAIN_NOISE, position) for position in batch["positions"]]
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         with noting(f"in training step {self.global_step + 1}", *self.world_model.children()):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
             loss = self.world_model.loss(latents, actions, generators)
-        check_gradient(loss, self.world_model)
+        if not loss.requires_grad:
+            name = type(self.world_model.model).__name__
+            raise TrainingError(
+                f"the loss of {name} has no gradient: do not detach tensors in its forward"
+            )
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self._losses.clear()
         self._losses.append(loss.detach())
@@ -194,8 +188,6 @@ class WorldModelTask(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set batch counters as if all steps had used the current number of batches per step."""
-        callbacks: list[Callback] = cast(Any, self.trainer).callbacks
-        keep_own_files(checkpoint.get("callbacks", {}), callbacks)
         steps = checkpoint["global_step"]
         progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
         before = progress["total"]["ready"]
@@ -221,16 +213,3 @@ def seed_of(*key: int) -> int:
 def generator_of(*key: int) -> torch.Generator:
     """A CPU generator seeded by `seed_of`."""
     return torch.Generator().manual_seed(seed_of(*key))
-
-
-def check_gradient(loss: Tensor, world_model: WorldModel) -> None:
-    """Refuse a loss that cannot train anything.
-
-    Raises:
-        TrainingError: it has no gradient.
-    """
-    if not loss.requires_grad:
-        name = type(world_model.model).__name__
-        raise TrainingError(
-            f"the loss of {name} has no gradient: do not detach tensors in its forward"
-        )

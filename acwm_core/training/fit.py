@@ -1,0 +1,221 @@
+"""`fit`: trains the model of a recipe into a run folder, from the start or resumed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback
+from torch.distributed import DistBackendError
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.clips import DataConfig
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.loader import WORKER_DIED
+from acwm_core.env.environment import resolve_size
+from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.model.build import build_world_model
+from acwm_core.model.world_model import WorldModel
+from acwm_core.recipe import Recipe, recipe_differences
+from acwm_core.training import callbacks
+from acwm_core.training.checkpoints import read_details
+from acwm_core.training.config import TrainingConfig
+from acwm_core.training.data import ClipData
+from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
+from acwm_core.training.module import TrainingModule
+from acwm_core.training.progress import StepProgress
+from acwm_core.training.resume import AUTO, checkpoint_to_resume, claimed, is_first_process
+from acwm_core.training.run import RunFolder, all_training, load_weights
+from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
+from acwm_core.training.threads import idle_cores
+from acwm_core.training.trained import find_run
+from acwm_core.training.trainer import build_trainer
+
+
+def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
+    """Train the world model of a recipe.
+
+    With several devices, Lightning runs the command of this process again for each of them. Those
+    processes exit at the end of this function; only the first returns.
+
+    Args:
+        recipe: what to train, on which data, and how long.
+        run_dir: the run folder to create; it must not hold a run yet.
+        resume: a run folder to resume instead, exactly at its last checkpoint. The recipe must be
+            the one it was started with, except for `FREE_TO_CHANGE`. Or ``"auto"``: resume
+            `run_dir` if training has saved a checkpoint there, else start; do nothing if it is
+            finished.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        TrainingError: the folder already holds a run; there is nothing to resume, or the recipe
+            differs; the data is of another environment; the loss stopped being finite.
+        StoppedEarly: a signal ended training; it can be resumed.
+        AcwmError: the recipe's components, the trainer flags or the data are wrong.
+    """
+    silence_irrelevant_warnings()
+    run = RunFolder(run_dir if resume in (None, AUTO) else resume)
+    with _quiet_after_the_first():
+        episodes = EpisodeDataset(recipe.data["path"], "train")
+        _check_environment(recipe, episodes.card)
+        checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
+        first_step = read_details(checkpoint)["global_step"] if checkpoint else 0
+        if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
+            _train(recipe, episodes, run, checkpoint, first_step)
+        elif resume != AUTO:
+            raise TrainingError(
+                f"{run.path} is finished after {first_step} steps; to train on, raise "
+                "trainer.max_steps"
+            )
+    if not is_first_process():
+        raise SystemExit(0)
+    return run.path
+
+
+def _train(
+    recipe: Recipe, episodes: EpisodeDataset, run: RunFolder, checkpoint: Path | None, step: int
+) -> None:
+    config = TrainingConfig(**recipe.training)
+    L.seed_everything(config.seed, verbose=False)
+    world_model = build_world_model(recipe, episodes.card.environment)
+    start = None
+    if config.init_from and checkpoint is None:
+        start = _start_from(config.init_from, world_model, recipe)
+    data = ClipData(DataConfig(**recipe.data), episodes, world_model.codec, config.seed)
+    module, preemption = TrainingModule(world_model, config), Preemption(run)
+    trainer = build_trainer(
+        recipe.trainer,
+        config,
+        [preemption, callbacks.CpuTime(start), *_callbacks(run, config, data)],
+        build_loggers(run, recipe.trainer, step),
+    )
+    threads = _use_threads(config, trainer, run if checkpoint else None)
+    recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
+    with (
+        _explained(trainer, run, preemption),
+        claimed(run, recipe, episodes.card, checkpoint, step, module),
+        preemption.watching(trainer),
+    ):
+        for logger in trainer.loggers:
+            logger.log_hyperparams(recipe.to_dict())
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+
+
+def _start_from(name: str, world_model: WorldModel, recipe: Recipe) -> dict[str, Any]:
+    """Load the weights of another run; returns what `all_training` knows of them."""
+    initial = RunFolder(find_run(name))
+    if not initial.weights.is_file():
+        raise TrainingError(f"training.init_from={name}: there is no run with trained weights")
+    try:
+        load_weights(world_model, initial.weights)
+    except TrainingError as error:
+        others = recipe_differences(Recipe.from_yaml(initial.recipe), recipe)
+        of_the_model = [each for each in others if each.startswith("model.")]
+        raise TrainingError("; ".join([str(error), *of_the_model])) from error
+    return all_training(name, initial)
+
+
+def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:
+    chosen: list[Callback] = [
+        callbacks.NanGuard(run),
+        callbacks.SavedWeights(run),
+        StepProgress(),
+        callbacks.LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
+        callbacks.BestCheckpoint(run.checkpoints),
+    ]
+    every, shown, rollouts = (
+        config.sample_every_n_steps,
+        config.sample_videos,
+        config.validation_rollouts,
+    )
+    video, actions = data.sample(max(shown if every else 0, rollouts))
+    if every and len(video):
+        fps = data.episodes.card.environment.fps
+        chosen.append(callbacks.SampleVideos(run, every, video[:shown], actions[:shown], fps))
+    if rollouts and len(video):
+        chosen.append(callbacks.ValidationRollouts(video[:rollouts], actions[:rollouts]))
+    return chosen
+
+
+def _use_threads(
+    config: TrainingConfig, trainer: L.Trainer, resumed: RunFolder | None
+) -> int | None:
+    """Set the number of CPU threads and return it, or None if PyTorch's default is used.
+
+    That of the recipe, else of the run that is resumed, for bitwise equal results. Else, if one
+    process trains on a CPU, that of OMP_NUM_THREADS, or as many as there are idle cores.
+    """
+    is_free = "OMP_NUM_THREADS" not in os.environ
+    threads = config.cpu_threads
+    if threads is None and resumed is not None:
+        threads = Recipe.from_yaml(resumed.recipe).training.get("cpu_threads")
+    elif threads is None and trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
+        threads = max(1, round(idle_cores())) if is_free else torch.get_num_threads()
+    if threads and (is_free or config.cpu_threads):
+        torch.set_num_threads(threads)
+    return threads
+
+
+def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
+    """Refuse a recipe whose environment or frame size differs from those of the data."""
+    if recipe.env is None:
+        return
+    found = card.environment
+    if recipe.env.name != found.name:
+        raise TrainingError(
+            f"{recipe.data['path']} holds episodes of {found.name}, but the recipe says "
+            f"env={recipe.env.name}: set env={found.name} or env=null, or another data.path"
+        )
+    size = recipe.env.params.get("size")
+    if size is not None and resolve_size(size, found.frame_size) != found.frame_size:
+        height, width = found.frame_size
+        raise TrainingError(
+            f"{recipe.data['path']} holds frames of {height}×{width}: leave out env.size, or "
+            "generate data of that size"
+        )
+
+
+@contextlib.contextmanager
+def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Generator[None]:
+    """Turn Ctrl-C, a removed run folder and dead processes into errors that say what to do."""
+    try:
+        yield
+    except SystemExit:  # raised by Lightning after a KeyboardInterrupt
+        raise preemption.stopped("interrupted") from None
+    except FileNotFoundError as error:
+        if run.recipe.exists():
+            raise
+        raise TrainingError(
+            f"{run.path} was removed or moved while it was trained: train it again"
+        ) from error
+    except RuntimeError as error:
+        if "DataLoader worker" in str(error):
+            raise TrainingError(WORKER_DIED) from error
+        # A collective operation fails if a process that takes part in it has ended.
+        is_of_a_lost_peer = isinstance(error, DistBackendError) or "gloo" in str(error)
+        if trainer.world_size == 1 or not is_of_a_lost_peer:
+            raise
+        raise TrainingError(
+            "another process of this training failed, see its message; once that is fixed, "
+            f"{how_to_resume(run)}"
+        ) from error
+
+
+@contextlib.contextmanager
+def _quiet_after_the_first() -> Generator[None]:
+    """Let only the first process report an error; the others just exit."""
+    try:
+        yield
+    except AcwmError as error:
+        if is_first_process():
+            raise
+        # 0 after a signal: otherwise Lightning kills the first process before it can report.
+        raise SystemExit(0 if isinstance(error, StoppedEarly) else error.exit_code) from None

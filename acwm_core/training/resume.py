@@ -1,0 +1,111 @@
+"""Which checkpoint a training resumes from, and the lock on its run folder."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any, cast
+
+import lightning as L
+from lightning.pytorch.utilities import rank_zero_only
+
+from acwm_core.data.atomic import held, written_whole
+from acwm_core.data.card import DatasetCard
+from acwm_core.errors import TrainingError
+from acwm_core.recipe import Recipe, recipe_differences
+from acwm_core.training.checkpoints import check_sums, last_whole, read_details
+from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.signals import StoppedEarly
+
+AUTO = "auto"
+"""Value of `resume`: resume if there is something to resume, else start a new run."""
+
+
+def is_first_process() -> bool:
+    """Whether this is the process that writes files and reports errors, of all that train."""
+    return cast(Any, rank_zero_only).rank == 0
+
+
+def checkpoint_to_resume(
+    run: RunFolder, recipe: Recipe, card: DatasetCard, resume: Path | str | None
+) -> Path | None:
+    """The checkpoint to resume from, or None to start.
+
+    The first process refuses a folder that holds another run, or a run that this recipe and data
+    cannot resume; the folder is in use by the time Lightning starts the others.
+    """
+    last = last_whole(run.last_checkpoint)
+    if not is_first_process():
+        return None if resume is None else last
+    if run.weights.exists() and "imported" in read_metadata(run.weights):
+        raise TrainingError(
+            f"{run.path} holds imported weights and no training to resume: start from them by "
+            f"training.init_from={run.path}, and train into another folder"
+        )
+    if not run.recipe.exists():
+        if last or resume not in (None, AUTO):
+            raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
+        return None
+    with held(run.path):  # fails if another command is training it: its files may be incomplete
+        pass
+    if resume is None:
+        raise TrainingError(
+            f"{run.path} holds a run already: continue it by resume={run.path}, or choose another "
+            "folder"
+            if last
+            else f"{run.path} holds a run without a checkpoint: if it is not running, remove the "
+            "folder; or choose another"
+        )
+    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
+    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
+    if differences:
+        raise TrainingError(
+            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
+            "the old one, or train into a new folder"
+        )
+    if last is not None:
+        check_sums(last)
+    elif resume != AUTO:
+        raise TrainingError(
+            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
+            "the folder and train anew"
+        )
+    return last
+
+
+@contextlib.contextmanager
+def claimed(
+    run: RunFolder,
+    recipe: Recipe,
+    card: DatasetCard,
+    checkpoint: Path | None,
+    first_step: int,
+    module: L.LightningModule,
+) -> Generator[None]:
+    """Lock the run folder and write recipe and card into it, while the first process trains.
+
+    If a new run fails before its first step, both are removed, so that it can be fixed and started
+    again in the same folder.
+    """
+    if not is_first_process():
+        yield
+        return
+    run.checkpoints.mkdir(parents=True, exist_ok=True)
+    with held(run.path):
+        last = last_whole(run.last_checkpoint)
+        if last != checkpoint or (last and read_details(last)["global_step"] != first_step):
+            raise TrainingError(
+                f"another command has trained {run.path} meanwhile: continue with resume={run.path}"
+            )
+        with written_whole(run.recipe) as partial:
+            partial.write_text(recipe.to_yaml(), encoding="utf-8")
+        card.write(run.path)
+        try:
+            yield
+        except Exception as error:
+            is_new = checkpoint is None and module.global_step == 0
+            if is_new and not isinstance(error, (StoppedEarly, OSError)):
+                run.recipe.unlink(missing_ok=True)
+                run.card.unlink(missing_ok=True)
+            raise
