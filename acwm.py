@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from acwm_core.evaluation.evaluate import evaluate_run as evaluate
     from acwm_core.model.build import build_world_model
     from acwm_core.model.world_model import WorldModel
-    from acwm_core.plugins import Component
     from acwm_core.recipe import Recipe, compose
     from acwm_core.training.fit import fit
     from acwm_core.training.run import load_run as load
@@ -77,6 +76,10 @@ _HOMES = {
 """Public names that are imported on first use, and where each is defined."""
 
 
+DREAM = "acwm/dream-v0"
+"""The Gymnasium id of the environment that is made of a world model."""
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         here = sys.modules[__name__]
@@ -96,11 +99,12 @@ def register() -> None:
         if name not in gymnasium.registry:
             # Environments truncate themselves at their card's horizon, so no TimeLimit is needed.
             gymnasium.register(id=name, entry_point=functools.partial(_make, component.name))
-    for component in catalog().registry("gymnasium_environment"):
-        name = f"acwm/{component.name}-v0"
-        if name not in gymnasium.registry:
-            many = functools.partial(_make_many, component)
-            gymnasium.register(id=name, entry_point=component.create, vector_entry_point=many)
+    if DREAM not in gymnasium.registry:
+        gymnasium.register(
+            id=DREAM,
+            entry_point="acwm_dream.environment:Dream",
+            vector_entry_point="acwm_dream.vector:DreamVector",
+        )
 
 
 @overload
@@ -188,14 +192,6 @@ def _make(name: str, *, task: str | None = None, **params: Any) -> Any:
     from acwm_core.env.task import TaskEnvironment
 
     return TaskEnvironment(component.create(**params), component.load_task(task))
-
-
-def _make_many(component: Component, *, num_envs: int, **params: Any) -> Any:
-    single = component.load()
-    if not hasattr(single, "vector"):
-        ids = [lambda: component.create(**params)] * num_envs
-        return gymnasium.vector.SyncVectorEnv(ids)
-    return single.vector(num_envs=num_envs, **params)
 
 
 register()

@@ -14,15 +14,15 @@ the plugins; one that fails is left out and reported, and the others work.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.metadata
 import importlib.util
 import re
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, TypeVar, cast
 
 import pluggy
 
@@ -30,31 +30,38 @@ from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, n
 
 Made = TypeVar("Made")
 
-ComponentKind = Literal[
-    "environment",
-    "codec",
-    "model",
-    "conditioner",
-    "metric",
-    "estimator",
-    "importer",
-    "dataset_importer",
-    "dataset_exporter",
-    "executor",
-    "protocol",
-    "table",
-    "trained_model",
-    "gymnasium_environment",
-    "task",
-    "planner",
-    "cost",
-    "driver",
-    "check",
-    "command",
-]
-"""The kinds of component that a plugin can provide."""
+KINDS = {
+    "environment": ("acwm_core.env.environment:Environment", "a world to act in"),
+    "codec": ("acwm_core.model.codec:Codec", "video to latents and back"),
+    "model": ("acwm_core.model.dynamics:DynamicsModel", "predicts latents"),
+    "conditioner": ("acwm_core.model.conditioner:Conditioner", "brings actions into a model"),
+    "metric": ("acwm_core.evaluation.metric:Metric", "scores predicted video"),
+    "estimator": (
+        "acwm_core.env.physics:StateEstimator",
+        "reads states from frames; has the name of its environment",
+    ),
+    "task": ("acwm_core.env.task:Task", "a goal; its name is ENVIRONMENT.TASK"),
+    "executor": ("acwm_core.executors:Executor", "runs work elsewhere"),
+    "protocol": (
+        "acwm_core.evaluation.protocol:Protocol",
+        "which clips an evaluation predicts, and tables that were measured so",
+    ),
+    "trained_model": ("pathlib:Path", "a run folder; of NAME://ADDRESS, made from an address"),
+    "command": ("click:Command", "a command of acwm; its module imports nothing heavy"),
+}
+"""Core's kinds of component: what a target is, and in a phrase. Plugins add kinds of their own."""
 
-COMPONENT_KINDS: tuple[ComponentKind, ...] = get_args(ComponentKind)
+CHECKED = ("environment", "codec", "model", "conditioner", "metric", "estimator", "task")
+"""Those of them with a conformance suite ``acwm_core.checks.check_KIND``."""
+
+REMOVED_HOOKS = {
+    "register_checks": "give the suite to the kind: `registry.add(…, check='module:suite')` in "
+    "`register_kinds`",
+    "register_completions": "give a parameter of your command a `shell_complete`",
+    "register_gymnasium_environments": "call `gymnasium.register`",
+    "register_tables": "return the tables from `Protocol.tables`, and register the protocol",
+}
+"""What replaces hooks of the release before."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class Component:
             `acwm_core.env.task.Task`; the modules import no simulator.
     """
 
-    kind: ComponentKind
+    kind: str
     name: str
     target: str
     plugin: str
@@ -162,6 +169,13 @@ class Component:
             module = f"{self.distribution}[{self.extra}]"
         return f"pip install '{module}'"
 
+    @property
+    def needs(self) -> str:
+        """Which required modules are not installed, and how to install them; empty if none."""
+        missing = self.missing_modules()
+        how = self.install_command(missing[0]) if missing else ""
+        return f"needs {', '.join(missing)}: {how}" if missing else ""
+
     def missing_modules(self) -> list[str]:
         """Modules in `requires` whose top-level package is not installed; imports nothing."""
         return [m for m in self.requires if importlib.util.find_spec(m.partition(".")[0]) is None]
@@ -170,8 +184,8 @@ class Component:
 class Registry:
     """The components of one kind. Each hook of a plugin gets a registry and calls its `add`."""
 
-    def __init__(self, kind: ComponentKind) -> None:
-        self.kind: ComponentKind = kind
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
         self._components: dict[str, Component] = {}
         self._plugin = ""
         self._distribution: str | None = None
@@ -201,26 +215,14 @@ class Registry:
             **defaults: parameters that this name presets.
 
         Raises:
-            PluginError: the name is taken or malformed, the target is not ``"module:attribute"``,
-                or an argument has the wrong type.
+            PluginError: the name is taken or malformed, or the target is not ``"module:Name"``.
         """
-        given: dict[str, tuple[object, Any]] = {
-            **{"name": (name, str), "target": (target, str), "summary": (summary, str)},
-            **{"extra": (extra, str | None), "physics": (physics, str | None)},
-            **{"requires": (requires, tuple), "tasks": (tasks or {}, Mapping)},  # no strings
-            **{f"requires[{place}]": (each, str) for place, each in enumerate(requires)},
-        }
-        if isinstance(tasks, Mapping):
-            given |= {f"tasks[{each!r}]": (where, str) for each, where in tasks.items()}
-        for what, (value, wanted) in given.items():
-            if not isinstance(value, wanted):
-                raise PluginError(
-                    f"{what} of {self.kind} {name!r:.60} is of the wrong type: {value!r:.60}"
-                )
         if not re.fullmatch(r"\w[\w.-]*", name):
             raise PluginError(f"{self.kind} {name!r} must consist of letters, digits, _, - and .")
         if not re.fullmatch(r"\w+(\.\w+)*:\w+", target):
             raise PluginError(f"target {target!r} of {self.kind} {name!r} is not 'module:Name'")
+        if isinstance(requires, str):
+            raise PluginError(f"requires={requires!r} of {self.kind} {name!r} must be a tuple")
         if name in self._components:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
@@ -232,11 +234,7 @@ class Registry:
         self._components.setdefault(component.name, component)
 
     def __getitem__(self, name: str) -> Component:
-        """Look up a component.
-
-        Raises:
-            UnknownNameError: nothing of this kind has that name; suggests a similar one.
-        """
+        """Look up a component; `UnknownNameError` suggests a similar name."""
         try:
             return self._components[name]
         except KeyError:
@@ -260,125 +258,24 @@ class Registry:
         return dict(self._components)
 
     def restore(self, components: Mapping[str, Component]) -> None:
-        """Restore earlier `components`, e.g. to undo the changes of a broken plugin."""
+        """Restore earlier `components`, to undo the changes of a broken plugin."""
         self._components = dict(components)
 
 
 PROJECT = "acwm"
 """Name of the pluggy project and of the entry-point group."""
 
-hookspec = pluggy.HookspecMarker(PROJECT)
 hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
-@hookspec(historic=True)
-def register_environments(registry: Registry) -> None:
-    """Add environments; targets are subclasses of `acwm_core.env.environment.Environment`."""
+def _hook_of(kind: str) -> tuple[str, type]:
+    """The name of the hook of a kind, and a namespace with its specification for pluggy."""
 
+    def register(registry: Registry) -> None: ...
 
-@hookspec(historic=True)
-def register_codecs(registry: Registry) -> None:
-    """Add codecs; targets are subclasses of `acwm_core.model.codec.Codec`."""
-
-
-@hookspec(historic=True)
-def register_models(registry: Registry) -> None:
-    """Add dynamics models; targets are subclasses of `acwm_core.model.dynamics.DynamicsModel`."""
-
-
-@hookspec(historic=True)
-def register_conditioners(registry: Registry) -> None:
-    """Add conditioners; targets are subclasses of `acwm_core.model.conditioner.Conditioner`."""
-
-
-@hookspec(historic=True)
-def register_metrics(registry: Registry) -> None:
-    """Add metrics; targets are subclasses of `acwm_core.evaluation.metric.Metric`."""
-
-
-@hookspec(historic=True)
-def register_estimators(registry: Registry) -> None:
-    """Add estimators; targets are subclasses of `acwm_core.env.physics.StateEstimator`.
-
-    An estimator has the name of its environment.
-    """
-
-
-@hookspec(historic=True)
-def register_importers(registry: Registry) -> None:
-    """Add importers; targets are subclasses of `CheckpointImporter`."""
-
-
-@hookspec(historic=True)
-def register_executors(registry: Registry) -> None:
-    """Add executors; targets are subclasses of `acwm_core.executors.Executor`."""
-
-
-@hookspec(historic=True)
-def register_dataset_importers(registry: Registry) -> None:
-    """Add formats to import; targets are subclasses of `acwm_core.data.formats.DatasetImporter`."""
-
-
-@hookspec(historic=True)
-def register_dataset_exporters(registry: Registry) -> None:
-    """Add formats to export; targets are subclasses of `acwm_core.data.formats.DatasetExporter`."""
-
-
-@hookspec(historic=True)
-def register_protocols(registry: Registry) -> None:
-    """Add protocols; targets are subclasses of `acwm_core.evaluation.protocol.Protocol`."""
-
-
-@hookspec(historic=True)
-def register_tables(registry: Registry) -> None:
-    """Add published tables; targets return an `acwm_core.evaluation.benchmark.PublishedTable`."""
-
-
-@hookspec(historic=True)
-def register_trained_models(registry: Registry) -> None:
-    """Add trained models, or sources of them; targets return the `Path` of a run folder.
-
-    For a request ``NAME://ADDRESS``, the target gets the parameter ``address``.
-    """
-
-
-@hookspec(historic=True)
-def register_gymnasium_environments(registry: Registry) -> None:
-    """Add ``acwm/NAME-v0``; targets are `gymnasium.Env`s, whose `vector` serves `make_vec`."""
-
-
-@hookspec(historic=True)
-def register_tasks(registry: Registry) -> None:
-    """Add tasks to environments of other plugins as ``ENVIRONMENT.TASK``; targets are `Task`s."""
-
-
-@hookspec(historic=True)
-def register_planners(registry: Registry) -> None:
-    """Add planners; targets are subclasses of `Planner`."""
-
-
-@hookspec(historic=True)
-def register_costs(registry: Registry) -> None:
-    """Add planning costs; targets are subclasses of `Cost`."""
-
-
-@hookspec(historic=True)
-def register_drivers(registry: Registry) -> None:
-    """Add who can drive; targets are subclasses of `Driver`."""
-
-
-@hookspec(historic=True)
-def register_commands(registry: Registry) -> None:
-    """Add commands of ``acwm``; targets are click commands, whose modules import nothing heavy.
-
-    ``after="evaluate"`` lists a command after that one, and ``after="acwm"`` before all others.
-    `acwm experiment` ends with the command named ``report``, as ``report FOLDER --out FILE``.
-    """
-
-
-@hookspec(historic=True)
-def register_checks(registry: Registry) -> None:
-    """Add conformance suites by the kind that they check; targets are called with a name."""
+    name = f"register_{kind}s"
+    specification = pluggy.HookspecMarker(PROJECT)(register, historic=True)
+    return name, type("Hooks", (), {name: specification})
 
 
 @dataclass(frozen=True)
@@ -400,38 +297,55 @@ class Catalog:
     def __init__(self) -> None:
         self.plugins: list[str] = []
         self.problems: list[Problem] = []
-        self._registries = {kind: Registry(kind) for kind in COMPONENT_KINDS}
-        self._registries["executor"].registering("acwm_core", "acwm")
-        self._registries["executor"].add(
+        self._registries: dict[str, Registry] = {}
+        self._manager = pluggy.PluginManager(PROJECT)
+        self._open("kind")
+        for kind, (target, summary) in KINDS.items():
+            check = f"acwm_core.checks:check_{kind}" if kind in CHECKED else ""
+            self.registry("kind").add(kind, target, summary=summary, check=check)
+            self._open(kind)
+        self.registry("executor").add(
             "processes",
             "acwm_core.executors:LocalExecutor",
             summary="processes of this machine; --workers 0 for none",
         )
-        self._manager = pluggy.PluginManager(PROJECT)
-        self._manager.add_hookspecs(sys.modules[__name__])
-        for kind, registry in self._registries.items():
-            # Historic: pluggy passes this registry to every plugin that is registered later.
-            hook = getattr(self._manager.hook, f"register_{kind}s")
-            hook.call_historic(kwargs={"registry": registry})
 
-    def registry(self, kind: ComponentKind) -> Registry:
-        """The registry of one kind."""
+    def _open(
+        self, kind: str, plugin: str = "acwm_core", distribution: str | None = "acwm"
+    ) -> None:
+        """Create the registry of a kind, and the hook by which plugins fill it."""
+        name, specification = _hook_of(kind)
+        self._manager.add_hookspecs(specification)
+        self._registries[kind] = registry = Registry(kind)
+        registry.registering(plugin, distribution)
+        # Historic: pluggy passes this registry to every plugin, also to those registered later.
+        getattr(self._manager.hook, name).call_historic(kwargs={"registry": registry})
+
+    @property
+    def kinds(self) -> list[str]:
+        """The kinds of components, those of core first."""
+        return [kind for kind in self._registries if kind != "kind"]
+
+    def registry(self, kind: str) -> Registry:
+        """The registry of one kind; `UnknownNameError` suggests a similar kind."""
+        if kind not in self._registries:
+            raise UnknownNameError("kind", kind, self._registries)
         return self._registries[kind]
 
-    def component(self, kind: ComponentKind, name: str) -> Component:
+    def component(self, kind: str, name: str) -> Component:
         """Look up a component.
 
         Raises:
             UnknownNameError: there is none; suggests a similar name, and lists broken plugins.
         """
-        registry = self._registries[kind]
+        registry = self.registry(kind)
         if name not in registry and self.problems:
             left = "; ".join(f"plugin {p.plugin!r} was left out: {p.reason}" for p in self.problems)
             known = registry.components()
             raise UnknownNameError(kind.replace("_", " "), name, known, f"({left})")
         return registry[name]
 
-    def create(self, kind: ComponentKind, name: str, **params: Any) -> Any:
+    def create(self, kind: str, name: str, **params: Any) -> Any:
         """Construct a component by name, importing its target now."""
         return self.component(kind, name).create(**params)
 
@@ -444,30 +358,30 @@ class Catalog:
             distribution: the package to pip install for its extras.
 
         Raises:
-            PluginError: a plugin of that name is already loaded; or this one implements no hook or
-                removes components of others.
+            PluginError: a plugin of that name is already loaded; or this one implements no hook, or
+                one that was removed.
             Exception: whatever the plugin raised, after everything it added was removed again.
         """
         if self._manager.has_plugin(name):
             raise PluginError(f"a plugin named {name!r} is already loaded")
+        for hook, instead in REMOVED_HOOKS.items():
+            if hasattr(plugin, hook):
+                raise PluginError(f"the hook {hook} was removed: {instead}")
         before = {kind: registry.components() for kind, registry in self._registries.items()}
         for registry in self._registries.values():
             registry.registering(name, distribution)
         try:
             self._manager.register(plugin, name)
+            for kind in self._registries["kind"].components().keys() - self._registries.keys():
+                self._open(kind, name, distribution)
             self._manager.check_pending()  # raises for a misspelt hook
             if not self._manager.get_hookcallers(plugin):
                 raise PluginError("it implements no hook: mark its functions with @hookimpl")
-            for kind, registry in self._registries.items():
-                now = registry.components()
-                for component in before[kind].values():
-                    if now.get(component.name) is not component:
-                        raise PluginError(f"it takes away {component.part} of another plugin")
         except BaseException:
             if self._manager.has_plugin(name):
                 self._manager.unregister(name=name)
             for kind, registry in self._registries.items():
-                registry.restore(before[kind])
+                registry.restore(before.get(kind, {}))
             raise
         self.plugins.append(name)
         self._share_tasks()
@@ -487,14 +401,28 @@ class Catalog:
                 self._registries["task"].include(task)
 
     def load_entry_points(self) -> None:
-        """Load every plugin of the entry-point group, in order of name, each independently."""
-        for entry_point in self._entry_points():
-            try:
-                distribution = entry_point.dist.name if entry_point.dist else None
-                with noting(f"in {entry_point.value}", entry_point.value):
-                    self.add_plugin(entry_point.load(), entry_point.name, distribution)
-            except (Exception, SystemExit) as error:  # a module may even call sys.exit
-                self.problems.append(Problem(entry_point.name, sentence(error)))
+        """Load every plugin of the entry-point group, each independently.
+
+        They are registered in order of name, but those that add kinds come before all others.
+        """
+        loaded: list[tuple[importlib.metadata.EntryPoint, object]] = []
+        for point in self._entry_points():
+            with self._reporting(point):
+                loaded.append((point, point.load()))
+        for point, plugin in sorted(
+            loaded, key=lambda each: not hasattr(each[1], "register_kinds")
+        ):
+            with self._reporting(point):
+                self.add_plugin(plugin, point.name, point.dist.name if point.dist else None)
+
+    @contextlib.contextmanager
+    def _reporting(self, point: importlib.metadata.EntryPoint) -> Generator[None]:
+        """Turn an error of the plugin in the block into a problem."""
+        try:
+            with noting(f"in {point.value}", point.value):
+                yield
+        except (Exception, SystemExit) as error:  # a module may even call sys.exit
+            self.problems.append(Problem(point.name, sentence(error)))
 
     def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
         """The entry points of all distributions; those with a damaged file become problems."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from acwm_core.errors import noting, sentence
-from acwm_core.plugins import ComponentKind, catalog
+from acwm_core.plugins import catalog
 
 Checked = str | Callable[..., Any]
 """The component to check: a registered name, or the class."""
@@ -82,7 +82,7 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
 class Suite:
     """Checks of a component: public methods without parameters. For the arguments see `check`."""
 
-    kind: ComponentKind
+    kind: str
 
     def __init__(self, component: Checked, **params: Any) -> None:
         self.name = component if isinstance(component, str) else None

@@ -10,7 +10,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from acwm_core.errors import AcwmError
-from acwm_core.plugins import COMPONENT_KINDS, ComponentKind, catalog
+from acwm_core.plugins import catalog
 from acwm_core.recipe.check import LIGHT, check_names
 from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
 from acwm_core.recipe.recipe import flat_items
@@ -21,10 +21,8 @@ Items = list[CompletionItem]
 
 
 def components(ctx: click.Context, incomplete: str) -> Items:
-    """Names of all components except commands and checks."""
-    kinds: list[ComponentKind] = [
-        kind for kind in COMPONENT_KINDS if kind not in ("command", "check")
-    ]
+    """Names of all components except commands."""
+    kinds = [kind for kind in catalog().kinds if kind != "command"]
     found = {each.name: each.summary for kind in kinds for each in catalog().registry(kind)}
     return _starting(incomplete, found.items())
 
@@ -76,7 +74,7 @@ def _keys(ctx: click.Context) -> Iterator[tuple[str, str]]:
 def _values(ctx: click.Context, key: str) -> list[str]:
     """The names of components, and the possible values of a parameter if its type lists them."""
     section, _, parameter = key.partition(".")
-    kind: Any = "environment" if section == "env" else section
+    kind = "environment" if section == "env" else section
     if section in COMPONENTS and not parameter:
         return [name for name, _ in _named(kind)]
     if section not in LIGHT:
@@ -90,14 +88,21 @@ def _values(ctx: click.Context, key: str) -> list[str]:
 def _recipe(ctx: click.Context) -> dict[str, Any]:
     """The recipe on the command line, with the defaults that are known without importing torch."""
     name = ctx.params.get("recipe") or ctx.params.get("file")
+    if not name:
+        return {}
     try:
-        given = read_recipe(name) if name else {}
-        return {**given, **check_names(given)} if given else {}
+        recipe = read_recipe(name)
+        recipe |= check_names(recipe)
     except AcwmError:
         return {}
+    for section in COMPONENTS:
+        if chosen := recipe.get(section):
+            kind = "environment" if section == "env" else section
+            recipe[section] = {**catalog().component(kind, chosen["name"]).defaults, **chosen}
+    return recipe
 
 
-def _named(kind: ComponentKind) -> list[tuple[str, str]]:
+def _named(kind: str) -> list[tuple[str, str]]:
     return [(each.name, each.summary) for each in catalog().registry(kind)]
 
 

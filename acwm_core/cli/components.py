@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from acwm_core.cli.arguments import split_parameters
 from acwm_core.errors import RecipeError, UnknownNameError, sentence
-from acwm_core.plugins import COMPONENT_KINDS, Component, ComponentKind
+from acwm_core.plugins import Component, catalog
 
 if TYPE_CHECKING:
-    from acwm_core.checks import CheckResult
+    from rich.table import Table
 
 SECTIONS: Mapping[str, str] = {
     "environment": "env",
@@ -22,47 +22,63 @@ SECTIONS: Mapping[str, str] = {
 """Kinds whose parameters can be set by overrides, and the section that such overrides name."""
 
 
+def _kinds(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """What `acwm list` lists, for shells to complete."""
+    return [kind for kind in (*catalog().kinds, "kind", "recipe") if kind.startswith(incomplete)]
+
+
 @click.command("list")
-@click.argument(
-    "kind", type=click.Choice([*COMPONENT_KINDS, "recipe"]), required=False, metavar="[KIND]"
-)
-def list_components(kind: Any) -> None:
+@click.argument("kind", required=False, shell_complete=_kinds)
+def list_components(kind: str | None) -> None:
     """List the installed components, or the recipes.
 
     Recipes use these names; an estimator has the name of its environment, and a task is
     ENVIRONMENT.TASK. The list also shows each component's plugin and what it needs that is not
-    installed. KIND lists one kind only, such as environment, codec or dataset_importer; task also
-    says what each is, and recipe lists those that `acwm fit` takes.
+    installed. KIND lists one kind only, such as environment or codec; task also says what each is,
+    kind lists the kinds, and recipe the recipes that `acwm fit` takes.
     """
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from acwm_core.plugins import catalog
 
     console = Console(highlight=False)
     if kind == "recipe":
-        from acwm_core.recipe import recipe_summaries
-
-        table = Table("recipe", "summary", box=None)
-        for row in recipe_summaries().items():
-            table.add_row(*map(escape, row))
-        console.print(table)
+        console.print(_recipes())
         return
-    for shown in (kind,) if kind else COMPONENT_KINDS:
-        table = Table(title=_plural(shown), title_justify="left", title_style="bold", box=None)
-        table.add_column("name", no_wrap=True)
-        for column in ("plugin", "summary"):
-            table.add_column(column, overflow="fold")
-        for component in catalog().registry(shown):
-            needs = escape(what_it_needs(component))
-            tasks = f"; tasks: {', '.join(component.tasks)}" if component.tasks else ""
-            about = escape((_summary(component) if kind else component.summary) + tasks)
-            summary = about + (f" [red]({needs})[/red]" if needs else "")
-            table.add_row(component.name, component.plugin, summary)
-        console.print(table, end="\n\n")
+    known = catalog().kinds
+    if kind not in (None, "kind", *known):
+        raise UnknownNameError("kind", kind, [*known, "kind", "recipe"])
+    for each in [kind] if kind else known:
+        console.print(_table(each, with_tasks=kind == "task"), end="\n\n")
     for problem in catalog().problems:
         console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
+
+
+def _recipes() -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from acwm_core.recipe import recipe_summaries
+
+    table = Table("recipe", "summary", box=None)
+    for row in recipe_summaries().items():
+        table.add_row(*map(escape, row))
+    return table
+
+
+def _table(kind: str, with_tasks: bool) -> Table:
+    """The components of a kind; `with_tasks` imports tasks to ask them what they are."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=_plural(kind), title_justify="left", title_style="bold", box=None)
+    table.add_column("name", no_wrap=True)
+    for column in ("plugin", "summary"):
+        table.add_column(column, overflow="fold")
+    for component in catalog().registry(kind):
+        tasks = f"; tasks: {', '.join(component.tasks)}" if component.tasks else ""
+        about = _task_summary(component) if with_tasks else component.summary
+        needs = f" [red]({escape(component.needs)})[/red]" if component.needs else ""
+        table.add_row(component.name, component.plugin, escape(about + tasks) + needs)
+    return table
 
 
 @click.command()
@@ -90,24 +106,18 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
     codec.weights=data/wan, metric.network=vgg. env=NAME sets the environment to test a metric on.
     Exit code 1 if a check fails.
     """
-    from acwm_core.plugins import catalog
-
-    kinds: list[ComponentKind] = [
-        kind for kind in COMPONENT_KINDS if name in catalog().registry(kind)
-    ]
+    kinds = [kind for kind in catalog().kinds if name in catalog().registry(kind)]
     if not kinds:
-        known = {each.name for kind in COMPONENT_KINDS for each in catalog().registry(kind)}
+        known = {each.name for kind in catalog().kinds for each in catalog().registry(kind)}
         raise UnknownNameError("component", name, known)
-    suites: dict[ComponentKind, Callable[..., Sequence[CheckResult]]] = {
-        kind: suite for kind in kinds if (suite := _suite(kind))
-    }
+    suites = {kind: suite for kind in kinds if (suite := _suite(kind))}
     if not suites:
         raise RecipeError(f"there are no checks of {_plural(kinds[0])}, and so none of {name}")
     parameters = _parameters_of_suites(name, [*suites], overrides)
     failed = 0
     for kind, suite in suites.items():
         click.echo(f"{kind} {name}")
-        for result in suite(name, **parameters[kind]):
+        for result in resolve_name(suite)(name, **parameters[kind]):
             failed += not result.passed
             click.echo(f"  {result}")
     if failed:
@@ -115,37 +125,23 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
         raise click.exceptions.Exit(1)
 
 
-def _suite(kind: ComponentKind) -> Callable[..., Sequence[CheckResult]] | None:
-    """The conformance suite of a kind, of core or of the plugin that defines the kind."""
-    from acwm_core.plugins import catalog
-
-    brought = catalog().registry("check")
-    checks = import_module("acwm_core.checks")
-    return brought[kind].load() if kind in brought else getattr(checks, f"check_{kind}", None)
+def _suite(kind: str) -> str | None:
+    """The target of a kind's conformance suite, if it has one."""
+    return catalog().component("kind", kind).defaults.get("check")
 
 
-def what_it_needs(component: Component) -> str:
-    """Which required modules are not installed, and how to install them; empty if none."""
-    missing = component.missing_modules()
-    return f"needs {', '.join(missing)}: {component.install_command(missing[0])}" if missing else ""
-
-
-def _summary(component: Component) -> str:
-    """The phrase for a component; a task that was registered without one is asked for it."""
-    if component.summary or component.kind != "task":
-        return component.summary
+def _task_summary(task: Component) -> str:
+    """The phrase for a task, which is asked for it unless it was registered with one."""
     try:
-        return str(component.load().summary)
+        return task.summary or str(task.load().summary)
     except Exception as error:  # whatever a plugin raises as it is imported
         return f"({sentence(error)})"
 
 
 def _parameters_of_suites(
-    name: str, kinds: Sequence[ComponentKind], overrides: Sequence[str]
-) -> dict[ComponentKind, dict[str, Any]]:
-    from acwm_core.plugins import catalog
-
-    parameters: dict[ComponentKind, dict[str, Any]] = {kind: {} for kind in kinds}
+    name: str, kinds: Sequence[str], overrides: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    parameters: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
     others = list(overrides)
     for kind in kinds if overrides else ():
         if kind in SECTIONS:
@@ -164,5 +160,5 @@ def _parameters_of_suites(
     return parameters
 
 
-def _plural(kind: ComponentKind) -> str:
+def _plural(kind: str) -> str:
     return f"{kind.replace('_', ' ')}s"

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import click
 
-from acwm_core.cli.components import what_it_needs
 from acwm_core.plugins import Component
 
 PACKAGES = ("torch", "lightning", "numpy", "gymnasium", "pydantic", "av", "pyarrow", "pluggy")
@@ -84,9 +83,8 @@ def findings() -> Iterator[Finding]:
     for problem in catalog().problems:
         yield Finding(f"plugin {problem.plugin}", False, problem.reason)
     for component in catalog().registry("executor"):  # the cluster may be elsewhere
-        needs = what_it_needs(component)
-        note = needs or _versions(component) or "installed"
-        yield Finding(f"executor {component.name}", None if needs else True, note)
+        note = component.needs or _versions(component) or "installed"
+        yield Finding(f"executor {component.name}", None if component.needs else True, note)
     engines: dict[object, list[Component]] = {}  # by required packages or module
     for component in catalog().registry("environment"):
         engine = component.requires or component.target.partition(":")[0]
@@ -106,9 +104,8 @@ def trial_of_engine(components: Sequence[Component]) -> Finding:
 def trial(component: Component) -> Finding:
     """Start an environment and take a step, in its own process as a bad library may crash it."""
     what = f"environment {component.name}"
-    needs = what_it_needs(component)
-    if needs:
-        return Finding(what, None, needs)
+    if component.needs:
+        return Finding(what, None, component.needs)
     engine = _versions(component)
     try:
         command = [sys.executable, "-P", "-c", _TRIAL, component.name]

@@ -1,4 +1,4 @@
-"""Published tables that benchmark plugins provide. Does not import torch."""
+"""Published tables that protocols provide. Does not import torch."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from acwm_core.errors import AcwmWarning, sentence
+from acwm_core.evaluation.protocol import Protocol
 from acwm_core.plugins import catalog
 
 
@@ -42,17 +43,15 @@ class PublishedRow:
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A published table, as created by the targets that plugins register with `register_tables`.
+    """A published table.
 
     Attributes:
         rows: the rows, in the order in which they are searched for one that matches a run.
         protocol: registered name of the protocol with which they were measured.
-        rank: tables of lower rank are searched first.
     """
 
     rows: Sequence[PublishedRow]
-    protocol: str = ""
-    rank: int = 100
+    protocol: str
 
 
 @dataclass(frozen=True)
@@ -70,14 +69,14 @@ class Published:
 
 
 def published_tables() -> dict[str, PublishedTable]:
-    """All registered tables by name, sorted by rank; broken ones are skipped with a warning."""
+    """The tables of all registered protocols by name; broken ones are skipped with a warning."""
     found: dict[str, PublishedTable] = {}
-    for each in catalog().registry("table"):
+    for each in catalog().registry("protocol"):
         try:
-            found[each.name] = each.create_as(PublishedTable)
-        except Exception as error:  # the table may not be needed, so only warn
+            found |= each.create_as(Protocol).tables()
+        except Exception as error:  # the tables may not be needed, so only warn
             warnings.warn(f"left out: {sentence(error)}", AcwmWarning, stacklevel=2)
-    return dict(sorted(found.items(), key=lambda item: item[1].rank))
+    return found
 
 
 def published_for(setting: Mapping[str, str | float]) -> Published | None:

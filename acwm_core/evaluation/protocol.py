@@ -9,6 +9,7 @@ from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import catalog
 
 if TYPE_CHECKING:
+    from acwm_core.evaluation.benchmark import PublishedTable
     from acwm_core.evaluation.config import EvaluationConfig
 
 FULL = "full"
@@ -38,6 +39,10 @@ class Protocol:
     def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
         """The clips of an episode of `length` frames: first frame and number of frames of each."""
         return [(0, min(length, config.frames or length))]
+
+    def tables(self) -> Mapping[str, PublishedTable]:
+        """Published tables that were measured so, by name, the first to be searched first."""
+        return {}
 
 
 def protocol_named(name: str) -> Protocol:

@@ -20,7 +20,7 @@ from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.dynamics import DynamicsModel
 from acwm_core.model.flow import Flow
 from acwm_core.model.world_model import WorldModel
-from acwm_core.plugins import ComponentKind, catalog
+from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, Recipe
 
 ComponentT = TypeVar("ComponentT")
@@ -140,7 +140,7 @@ def build_conditioner(
 
 
 def build_component(
-    kind: ComponentKind, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
+    kind: str, choice: ComponentConfig, base: type[ComponentT], **fitted: Any
 ) -> ComponentT:
     """Build the component that a recipe names, which must be a `base`.
 

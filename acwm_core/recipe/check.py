@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from acwm_core.env.environment import Environment
 from acwm_core.errors import RecipeError, suggest
-from acwm_core.plugins import Component, ComponentKind, catalog
+from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.metrics import MetricConfig, class_of_library, metric_configs
@@ -137,8 +137,7 @@ def _component(section: str, choice: Any) -> tuple[Component, dict[str, Any]]:
     name = params.pop("name", None)
     if not isinstance(name, str):
         raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
-    kind: ComponentKind = "environment" if section == "env" else section  # pyright: ignore[reportAssignmentType]
-    return catalog().component(kind, name), params
+    return catalog().component("environment" if section == "env" else section, name), params
 
 
 def _signature_of(component: Component) -> Signature:

@@ -9,7 +9,7 @@ from typing import Any
 
 from tables import cell, code, table
 
-from acwm_core.plugins import COMPONENT_KINDS, Component, catalog
+from acwm_core.plugins import Component, catalog
 from acwm_core.recipe.check import FITTED, SECTIONS
 from acwm_core.recipe.signature import REQUIRED, Parameter, signature
 from acwm_core.recipe.types import describe
@@ -36,7 +36,7 @@ _COLUMNS = ("Type", "Default", "What it is")
 def components_page() -> str:
     """Every component by kind, with the parameters that can be set."""
     parts: list[str] = []
-    for kind in COMPONENT_KINDS:
+    for kind in catalog().kinds:
         found = list(catalog().registry(kind))
         if kind in ("command", "task") or not found:  # tasks are named with their environment
             continue
@@ -79,7 +79,7 @@ def _component(component: Component) -> list[str]:
     facts.append(f"Plugin `{component.plugin}`.")
     anchor = f"{component.kind}-{component.name}"
     fitted = {"environment": _EVERY_WORLD, **FITTED}.get(component.kind, ())
-    takes = component.kind not in ("table", "trained_model", "protocol")
+    takes = component.kind not in ("trained_model", "protocol")
     rows = _parameters(component.load(), component.defaults, fitted) if takes else ()
     return [
         f"### {component.name} {{: #{anchor} }}",

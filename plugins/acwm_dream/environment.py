@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import ActionError, RecipeError
 from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
-from acwm_dream.vector import DreamVector
 
 
 class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
@@ -38,7 +37,7 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         AcwmError: the dream cannot be created; see `Dreams`.
     """
 
-    vector = DreamVector
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (as Gymnasium declares it)
 
     def __init__(
         self, *, render_mode: Literal["rgb_array"] | None = "rgb_array", **settings: Any
@@ -47,7 +46,7 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
             raise RecipeError(f"render_mode={render_mode!r}: frames are rendered as 'rgb_array'")
         self._dreams = Dreams(settings_of(settings), 1)
         card, self.repeat, self.render_mode = self._dreams.card, self._dreams.repeat, render_mode
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": card.fps / self.repeat}
+        self.metadata = {**self.metadata, "render_fps": card.fps / self.repeat}
         self.observation_space, self.action_space = spaces_of(self._dreams)
         self._steps = -1
         self._frame = np.zeros((*card.frame_size, 3), np.uint8)

@@ -1,16 +1,6 @@
-"""Registers the environment made from a model, and `acwm rollout`."""
+"""Registers `acwm rollout`."""
 
 from acwm_core.plugins import Registry, hookimpl
-
-
-@hookimpl
-def register_gymnasium_environments(registry: Registry) -> None:
-    """Add ``acwm/dream-v0``."""
-    registry.add(
-        "dream",
-        "acwm_dream.environment:Dream",
-        summary="an environment made of a world model: run=RUN, task=TASK",
-    )
 
 
 @hookimpl

@@ -13,7 +13,7 @@ import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
-from acwm_core.plugins import Component, ComponentKind, Registry
+from acwm_core.plugins import Component, Registry
 from acwm_core.untrusted import printable
 
 
@@ -106,9 +106,9 @@ class FormatGroup(click.Group):
         base: called with the component, a dict of its parameters, and the options of `base`.
     """
 
-    def __init__(self, kind: ComponentKind, base: click.Command) -> None:
+    def __init__(self, kind: str, base: click.Command) -> None:
         super().__init__(base.name, help=base.help)
-        self._kind: ComponentKind = kind
+        self._kind = kind
         self._base = base
 
     def list_commands(self, ctx: click.Context) -> list[str]:

@@ -4,6 +4,23 @@ from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
+def register_kinds(registry: Registry) -> None:
+    """Add the kinds of component that read and write other formats."""
+    registry.add(
+        "dataset_importer",
+        "acwm_core.data.formats:DatasetImporter",
+        summary="reads datasets in another format",
+        check="acwm_formats.checks:check_dataset_importer",
+    )
+    registry.add(
+        "dataset_exporter",
+        "acwm_core.data.formats:DatasetExporter",
+        summary="writes datasets in another format",
+        check="acwm_formats.checks:check_dataset_exporter",
+    )
+
+
+@hookimpl
 def register_dataset_importers(registry: Registry) -> None:
     """Add importers for robot recordings, rollouts and the published release."""
     registry.add(
@@ -60,10 +77,3 @@ def register_commands(registry: Registry) -> None:
         summary="encode the clips of a dataset as latents",
         after="data",
     )
-
-
-@hookimpl
-def register_checks(registry: Registry) -> None:
-    """Add the conformance suite of the kinds that this package defines."""
-    registry.add("dataset_importer", "acwm_formats.checks:check_dataset_importer")
-    registry.add("dataset_exporter", "acwm_formats.checks:check_dataset_exporter")

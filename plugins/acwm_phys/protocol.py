@@ -11,6 +11,7 @@ import numpy as np
 from acwm_core.evaluation.protocol import Protocol
 
 if TYPE_CHECKING:
+    from acwm_core.evaluation.benchmark import PublishedTable
     from acwm_core.evaluation.config import EvaluationConfig
 
 DRAW_SEED = 0
@@ -30,6 +31,12 @@ class PublishedWindows(Protocol):
     }
     cuts_windows = True
     from_first_frame = False
+
+    def tables(self) -> Mapping[str, PublishedTable]:
+        """The tables of the paper."""
+        from acwm_phys.tables import published_tables
+
+        return published_tables()
 
     def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
         """A fixed draw by Python's generator, ``random.Random(0).sample``."""

@@ -19,21 +19,17 @@ FACTORS = {"mse": 1000, "m_mse": 1000, "ssim": 1, "psnr": 1}
 """The paper prints MSE and M-MSE in thousandths."""
 
 
-def published_table(table: str) -> PublishedTable:
-    """A table of the paper.
-
-    Args:
-        table: name of the table.
-    """
-    content = _content()
-    found, rank = content["tables"][table], list(content["tables"]).index(table)
-    rows = [_row(table, found, row, content) for row in found["rows"]]
-    return PublishedTable(rows, PROTOCOL, rank)
-
-
 @functools.cache
-def _content() -> Mapping[str, Any]:
-    return yaml.safe_load(resources.files("acwm_phys").joinpath("tables.yaml").read_text("utf-8"))
+def published_tables() -> dict[str, PublishedTable]:
+    """The tables by name."""
+    text = resources.files("acwm_phys").joinpath("tables.yaml").read_text("utf-8")
+    content = yaml.safe_load(text)
+    return {
+        name: PublishedTable(
+            [_row(name, table, row, content) for row in table["rows"]], protocol=PROTOCOL
+        )
+        for name, table in content["tables"].items()
+    }
 
 
 def _row(

@@ -1,6 +1,27 @@
-"""Registers planners, costs, a driver that plans, `acwm plan` and `acwm rank`."""
+"""Registers the kinds planner, cost and driver, some of each, `acwm plan` and `acwm rank`."""
 
 from acwm_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_kinds(registry: Registry) -> None:
+    """Add the kinds of component that planning consists of."""
+    registry.add(
+        "planner",
+        "acwm_planning.planner:Planner",
+        summary="finds the actions that cost least",
+        check="acwm_planning.checks:check_planner",
+    )
+    registry.add(
+        "cost",
+        "acwm_planning.planner:Cost",
+        summary="how far imagined futures are from a goal",
+    )
+    registry.add(
+        "driver",
+        "acwm_planning.planner:Driver",
+        summary="solves a task in `acwm play`, from pictures",
+    )
 
 
 @hookimpl
@@ -77,9 +98,3 @@ def register_commands(registry: Registry) -> None:
         summary="rank policies in a model, and compare with the simulator",
         after="plan",
     )
-
-
-@hookimpl
-def register_checks(registry: Registry) -> None:
-    """Add the conformance suite of the kind that this package defines."""
-    registry.add("planner", "acwm_planning.checks:check_planner")

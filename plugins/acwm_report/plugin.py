@@ -10,7 +10,7 @@ def register_commands(registry: Registry) -> None:
         "evaluate",
         "acwm_report.evaluate:evaluate",
         summary="measure how good a trained model is",
-        after="fit",
+        after="import-checkpoint",
     )
     registry.add(
         "report",

@@ -16,6 +16,6 @@ def about_published(summary: Summary) -> str:
     if not same:
         facts.append("this run has other components")
     table = published_tables().get(row.table)  # none where its plugin is not installed
-    if table and table.protocol and summary.protocol != table.protocol:
+    if table and summary.protocol != table.protocol:
         facts.append(f"measured on other clips: compare with --protocol {table.protocol}")
     return "; ".join(facts) + (f". {row.note}" if row.note else "")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from acwm_core.plugins import ComponentKind
-
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of template; its files are in the folder with its name."""
 
-    registers: ComponentKind  # kind of the component that the package registers
+    registers: str  # kind of the component that the package registers
     summary: str  # summary of the component, for `acwm list`
     use: str  # a command that uses the component, with NAME as its name
 

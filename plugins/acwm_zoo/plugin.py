@@ -33,9 +33,14 @@ def register_commands(registry: Registry) -> None:
 
 
 @hookimpl
-def register_checks(registry: Registry) -> None:
-    """Add the conformance suite of the kind that this package defines."""
-    registry.add("importer", "acwm_zoo.checks:check_importer")
+def register_kinds(registry: Registry) -> None:
+    """Add the kind of component that reads checkpoints of other programs."""
+    registry.add(
+        "importer",
+        "acwm_zoo.importer:CheckpointImporter",
+        summary="reads checkpoints of other programs",
+        check="acwm_zoo.checks:check_importer",
+    )
 
 
 @hookimpl

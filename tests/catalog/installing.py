@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from acwm_core.plugins import COMPONENT_KINDS, Catalog
+from acwm_core.plugins import Catalog
 
 Install = Callable[..., None]
 
@@ -23,8 +23,8 @@ REFERENCE = loaded()
 def unharmed(catalog: Catalog) -> bool:
     """Whether every component that is there without the test's plugins is still there."""
     components = {
-        (kind, component.name) for kind in COMPONENT_KINDS for component in catalog.registry(kind)
+        (kind, component.name) for kind in catalog.kinds for component in catalog.registry(kind)
     }
     return components >= {
-        (kind, component.name) for kind in COMPONENT_KINDS for component in REFERENCE.registry(kind)
+        (kind, component.name) for kind in REFERENCE.kinds for component in REFERENCE.registry(kind)
     }

@@ -5,10 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from acwm_core.checks import check_importer
 from acwm_core.checks.result import checks_of
 from acwm_core.errors import CheckpointError
-from acwm_zoo.checks import ImporterChecks
+from acwm_zoo.checks import ImporterChecks, check_importer
 from acwm_zoo.published_dit import PublishedCheckpoint
 from tests.checks.results import Flaws, failures, installed
 

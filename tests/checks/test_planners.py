@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from acwm_core.checks import check_planner
 from acwm_core.checks.result import checks_of
-from acwm_planning.checks import PlannerChecks
+from acwm_planning.checks import PlannerChecks, check_planner
 from acwm_planning.planner import Plan, Planner
 from tests.checks.results import Flaws, failures, installed
 

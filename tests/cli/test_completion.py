@@ -44,6 +44,7 @@ def test_recipes_and_experiments():
 def test_keys_come_with_their_values():
     rate = compose("push_cube_small").training["learning_rate"]
     assert found("fit push_cube_small", "training.learning") == [f"training.learning_rate={rate}"]
+    assert found("fit push_cube_small", "model.wi") == ["model.width=128"]
     assert "model=dit_l" in found("show push_cube_small", "model=")
     assert "codec=compact" in found("show push_cube_small", "cod")
     assert found("fit push_cube_small", "+sm") == ["+small"]

@@ -13,6 +13,7 @@ import acwm
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import ActionError, AcwmError, RecipeError
+from acwm_dream.environment import Dream
 from tests.planning import tiny
 from tests.policies import slide
 
@@ -193,7 +194,7 @@ def test_what_cannot_be_had_is_told_in_a_sentence(run, settings, message):
     words = {"run": run, "task": "place", **settings}
     words = {name: value for name, value in words.items() if value is not None}
     with pytest.raises(AcwmError, match=message):
-        acwm.catalog().create("gymnasium_environment", "dream", **words)
+        Dream(**words)
 
 
 def test_actions_are_checked(run):

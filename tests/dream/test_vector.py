@@ -6,9 +6,7 @@ import pytest
 
 import acwm
 from acwm_core.errors import ActionError, AcwmError
-from acwm_core.plugins import catalog
 from tests.planning import tiny
-from tests.plugins import plugin_of
 from tests.policies import slide
 
 acwm.register()
@@ -94,13 +92,3 @@ def test_what_cannot_be(run):
         many.step(np.zeros((3, 2), np.float32))
     with pytest.raises(AcwmError, match="num_envs=0"):
         dreams(run, 0)
-
-
-def test_environments_of_plugins_are_known_to_gymnasium():
-    """Without a batched version of their own, Gymnasium's does."""
-    where = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
-    catalog().add_plugin(plugin_of(gymnasium_environments={"pole": where}), "pole")
-    acwm.register()
-    assert gymnasium.make("acwm/pole-v0").reset(seed=0)[0].shape == (4,)
-    many = gymnasium.make_vec("acwm/pole-v0", num_envs=2)
-    assert many.reset(seed=0)[0].shape == (2, 4)

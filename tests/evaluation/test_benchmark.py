@@ -6,7 +6,6 @@ from types import MappingProxyType
 import pytest
 from click.testing import CliRunner
 
-from acwm_core import evaluation
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.evaluation.benchmark import (
@@ -35,12 +34,12 @@ class Ends(Protocol):
     def windows(self, length, config):
         return [(length - config.frames, config.frames)]
 
-
-def table():
-    setting = {"env": "drift", "model": "big", "codec": "x", "conditioner": "y", "fraction": 1.0}
-    scores = {"ind_test": {"mse": 0.25}, "ood_test": {"mse": 0.5}}
-    row = PublishedRow("drifters", "tab:1", "Drift", "Foo 2031", "Big", "", setting, scores)
-    return PublishedTable([row], "ends")
+    def tables(self):
+        setting = {"env": "drift", "model": "big", "codec": "x", "conditioner": "y"}
+        setting["fraction"] = 1.0
+        scores = {"ind_test": {"mse": 0.25}, "ood_test": {"mse": 0.5}}
+        row = PublishedRow("drifters", "tab:1", "Drift", "Foo 2031", "Big", "", setting, scores)
+        return {"drifters": PublishedTable([row], "ends")}
 
 
 class Benchmark:
@@ -50,18 +49,14 @@ class Benchmark:
         registry.add("ends", f"{__name__}:Ends")
         registry.add("broken", "builtins:list")
 
-    @staticmethod
-    @hookimpl
-    def register_tables(registry):
-        registry.add("drifters", f"{__name__}:table")
-
 
 @pytest.fixture
 def benchmark(monkeypatch):
     """A catalog with that plugin and no other protocol or table."""
     catalog = Catalog()
     catalog.add_plugin(Benchmark, "benchmark")
-    monkeypatch.setattr("acwm_core.evaluation.benchmark.catalog", lambda: catalog)
+    for module in ("benchmark", "protocol"):
+        monkeypatch.setattr(f"acwm_core.evaluation.{module}.catalog", lambda: catalog)
 
 
 def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_path):
@@ -89,17 +84,13 @@ def test_names_that_nothing_brings_are_refused_in_a_sentence(benchmark):
         EvaluationConfig(protocol="acwm-phys")
     with pytest.raises(PluginError, match="returns a list, not a Protocol"):
         protocol_named("broken")
-    assert published_for({"env": "push_cube"}) is None
 
 
-class BrokenTable:
-    @staticmethod
-    @hookimpl
-    def register_tables(registry):
-        registry.add("a_broken_one", "builtins:list")
+def test_a_broken_protocol_takes_no_table_with_it(benchmark):
+    with pytest.warns(UserWarning, match="left out: protocol 'broken' returns a list"):
+        found = published_for({"env": "drift"})
+    assert found.row.row == "Big"
 
 
-def test_a_broken_table_takes_no_other_with_it(benchmark):
-    evaluation.benchmark.catalog().add_plugin(BrokenTable, "broken")
-    with pytest.warns(UserWarning, match="left out: table 'a_broken_one' returns a list"):
-        assert published_for({"env": "drift"}).row.row == "Big"
+def test_no_row_is_of_another_environment():
+    assert published_for({"env": "push_cub"}) is None

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.checks import check_dataset_exporter, check_dataset_importer
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.formats import DatasetExporter, DatasetImporter, import_command
@@ -19,6 +18,7 @@ from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError
 from acwm_core.plugins import catalog, hookimpl
+from acwm_formats.checks import check_dataset_exporter, check_dataset_importer
 from tests.checks.results import failures, installed
 
 ACTION = ActionSpec(("x",), ("",), (-1.0,), (1.0,), "delta")
