@@ -17,6 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+import platformdirs
+
 from acwm_core.data.atomic import OF_THE_DISK, alone, written_whole
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.manifest import MANIFEST, MAX_BYTES, ShardRecord, file_sha256
@@ -47,6 +49,11 @@ PROTOCOLS = {
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
 
+def cache_folder() -> Path:
+    """The folder in which acwm caches files for the user."""
+    return Path(os.environ.get(CACHE) or platformdirs.user_cache_path("acwm"))
+
+
 def data_folder(path: str | Path) -> Path:
     """The local folder of a dataset: `path` itself, or a folder in the cache if it is a URL.
 
@@ -60,8 +67,7 @@ def data_folder(path: str | Path) -> Path:
     if isinstance(path, Path) or not URL.match(path) or Path(path).exists():
         return Path(path)
     url = path.rstrip("/")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
-    cache = Path(os.environ.get(CACHE) or home) / "data"
+    cache = cache_folder() / "data"
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache) as temporary:

@@ -11,21 +11,14 @@ import os
 import re
 import secrets
 import socket
-from pathlib import Path
 
-from acwm_core.data.remote import CACHE
+from acwm_core.data.remote import cache_folder
 from acwm_core.errors import RecipeError
 
 HOST = "127.0.0.1"
 
 PORT = 8426
 """The default port, used if it is free."""
-
-
-def cache_folder() -> Path:
-    """The folder in which acwm caches files for the user."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "acwm"
-    return Path(os.environ.get(CACHE) or home)
 
 
 def token() -> str:

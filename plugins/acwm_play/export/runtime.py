@@ -9,8 +9,8 @@ import tempfile
 from pathlib import Path
 
 from acwm_core.data.atomic import made_whole, writing
+from acwm_core.data.remote import cache_folder
 from acwm_core.errors import DataError, RecipeError
-from acwm_play.address import cache_folder
 
 PACKAGE, VERSION = "onnxruntime-web", "1.30.0"
 
