@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 import acwm
-from acwm_planning.run import Bench
+from acwm_planning.run import EpisodePlayer
 from acwm_planning.settings import settings_of
 
 # %% [markdown]
@@ -41,7 +41,7 @@ picture  # the start, and the goal
 # %%
 words = ["planner=cem", "planner.candidates=24", "planner.iterations=2", "planner.elites=6"]
 words += ["planner.horizon=2", "planner.action_block=4", "max_steps=12"]
-bench = Bench(acwm.load("reacher"), "reach", settings_of(words))
+bench = EpisodePlayer(acwm.load("reacher"), "reach", settings_of(words))
 played, controller = bench.play("model", seed=0)
 decision = controller.decisions[0]
 print(f"{len(controller.decisions)} decisions, success: {played.success}")

@@ -15,7 +15,7 @@ from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
-    from acwm_experiment.plan import Plan
+    from acwm_experiment.plan import ExperimentPlan
 
 COMMAND = (sys.executable, "-m", "acwm_core.cli")
 """The command that runs a step; the words of the step are appended."""
@@ -105,7 +105,7 @@ def experiment(
         _run(plan, jobs)
 
 
-def _run(plan: Plan, jobs: int) -> None:
+def _run(plan: ExperimentPlan, jobs: int) -> None:
     from acwm_experiment.runner import run_experiment
 
     steps, before, failures = run_experiment(plan, COMMAND, jobs=jobs, say=_say)

@@ -11,20 +11,20 @@ from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, recipe_folder
 from acwm_experiment.files import DataChoice, ExperimentFile, slug
 from acwm_experiment.logs import StepLogs
-from acwm_experiment.runs import PlannedDataset, PlannedRun
+from acwm_experiment.runs import DatasetSpec, RunSpec
 from acwm_experiment.table import Experiment, ExperimentCell
-from acwm_experiment.tasks import TaskPlan, planned_tasks
+from acwm_experiment.tasks import PlanCommand, plan_commands
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExperimentPlan:
     """An experiment whose recipes are all checked."""
 
     folder: Path  # folder of the experiment
     experiment: Experiment  # the table, with the run folders of its cells
     # each run once, ordered by seed, so that the table of the first seed is complete first
-    runs: tuple[PlannedRun, ...]
-    tasks: tuple[TaskPlan, ...] = ()  # the tasks to solve by planning, table by table
+    runs: tuple[RunSpec, ...]
+    tasks: tuple[PlanCommand, ...] = ()  # the tasks to solve by planning, table by table
 
     @property
     def report(self) -> Path:
@@ -37,7 +37,7 @@ class Plan:
         return StepLogs(self.folder / "logs")
 
 
-def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> Plan:
+def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> ExperimentPlan:
     """Compose the recipe of every cell and find the datasets and runs that it needs.
 
     Args:
@@ -59,11 +59,11 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
         )
         for cell in experiment.cells
     )
-    found: dict[Path, PlannedRun] = {}
+    found: dict[Path, RunSpec] = {}
     for place, seed in enumerate(experiment.seeds):
         for cell, (argument, recipe) in zip(cells, composed, strict=True):
             headings = [name for name, rows in experiment.groups.items() if cell.row in rows]
-            run = PlannedRun(
+            run = RunSpec(
                 folder=cell.runs[place],
                 title=f"{' · '.join([*headings, cell.title])} · seed {seed}",
                 arguments=(argument, *cell.overrides, f"training.seed={seed}"),
@@ -77,9 +77,9 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> P
                     "recipes differ: give them different names"
                 )
     experiment = replace(experiment, cells=cells)
-    tasks = planned_tasks(file.tasks, experiment, found, folder)
-    experiment = replace(experiment, plans=tuple(each.planned for each in tasks))
-    return Plan(folder, experiment, tuple(found.values()), tasks)
+    tasks = plan_commands(file.tasks, experiment, found, folder)
+    experiment = replace(experiment, plans=tuple(each.job for each in tasks))
+    return ExperimentPlan(folder, experiment, tuple(found.values()), tasks)
 
 
 def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
@@ -96,13 +96,13 @@ def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
     return str(path), recipe
 
 
-def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> PlannedDataset | None:
+def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> DatasetSpec | None:
     path, env = recipe.data["path"], recipe.env
     if ":" in path:  # a URL
         return None
     if env and file.simulates:
         choice = file.data.get(env.name) or file.data.get("default") or DataChoice()
-        return PlannedDataset(Path(path), env.name, choice)
+        return DatasetSpec(Path(path), env.name, choice)
     if not (Path(path) / CARD).is_file():
         if env:
             make = f"acwm generate {env.name} --out {path}"

@@ -10,7 +10,7 @@ from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
 from acwm_core.executors import BatchExecutor, JobState, available_cores, create_executor
 from acwm_experiment.local import LocalRunner
-from acwm_experiment.plan import Plan
+from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.steps import Step, all_progress, all_steps, step_progress
 from acwm_experiment.table import FILE, Experiment
 
@@ -19,7 +19,7 @@ Say = Callable[[str], None]
 
 
 def run_experiment(
-    plan: Plan, command: Sequence[str], *, jobs: int = 1, say: Say
+    plan: ExperimentPlan, command: Sequence[str], *, jobs: int = 1, say: Say
 ) -> tuple[int, int, dict[str, str]]:
     """Run the remaining steps of an experiment on this machine.
 
@@ -54,7 +54,12 @@ def run_experiment(
 
 
 def submit_experiment(
-    plan: Plan, command: Sequence[str], executor: str, options: Mapping[str, object], *, say: Say
+    plan: ExperimentPlan,
+    command: Sequence[str],
+    executor: str,
+    options: Mapping[str, object],
+    *,
+    say: Say,
 ) -> int:
     """Submit the remaining steps of an experiment that are not queued yet, one job per step.
 
@@ -93,7 +98,7 @@ def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchEx
     return executor
 
 
-def _jobs(plan: Plan) -> dict[str, JobState]:
+def _jobs(plan: ExperimentPlan) -> dict[str, JobState]:
     """The states of submitted jobs, by step; batch systems that are not available are skipped."""
     found: dict[str, JobState] = {}
     for folder in sorted((plan.folder / "jobs").glob("*")):
@@ -103,7 +108,7 @@ def _jobs(plan: Plan) -> dict[str, JobState]:
 
 
 @contextlib.contextmanager
-def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
+def _prepared(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[list[Step]]:
     """Create and lock the experiment's folder with `experiment.json`, and yield the steps left.
 
     Raises:
@@ -127,7 +132,7 @@ def _prepared(plan: Plan, steps: Sequence[Step]) -> Generator[list[Step]]:
         yield [step for step in steps if progress[step.name] < 1]
 
 
-def overview(plan: Plan) -> Iterator[str]:
+def overview(plan: ExperimentPlan) -> Iterator[str]:
     """Lines on the progress of an experiment: one per step and a summary. Changes nothing.
 
     Raises:
@@ -149,7 +154,7 @@ def overview(plan: Plan) -> Iterator[str]:
 
 
 def _state(
-    plan: Plan, step: Step, progress: float, job: JobState | None, *, busy: bool
+    plan: ExperimentPlan, step: Step, progress: float, job: JobState | None, *, busy: bool
 ) -> tuple[str, str]:
     if progress == 1:
         return "done", ""

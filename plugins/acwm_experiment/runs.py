@@ -10,7 +10,7 @@ from acwm_experiment.files import DataChoice
 
 
 @dataclass(frozen=True)
-class PlannedDataset:
+class DatasetSpec:
     """A dataset to train and test on."""
 
     path: Path  # its folder
@@ -19,7 +19,7 @@ class PlannedDataset:
 
 
 @dataclass(frozen=True)
-class PlannedRun:
+class RunSpec:
     """One training and its evaluation."""
 
     folder: Path  # the run folder
@@ -27,7 +27,7 @@ class PlannedRun:
     arguments: tuple[str, ...]  # recipe and overrides for `acwm fit`
     recipe: Recipe  # the recipe composed from them
     # the dataset that it needs; None for the user's own data or data behind a URL
-    dataset: PlannedDataset | None
+    dataset: DatasetSpec | None
 
     @property
     def max_steps(self) -> int:

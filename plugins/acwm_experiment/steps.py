@@ -18,11 +18,11 @@ from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes
 from acwm_experiment.files import slug
-from acwm_experiment.plan import Plan
-from acwm_experiment.runs import PlannedDataset, PlannedRun
+from acwm_experiment.plan import ExperimentPlan
+from acwm_experiment.runs import DatasetSpec, RunSpec
 from acwm_experiment.table import FILE, SUMMARY
-from acwm_experiment.tasks import TaskPlan
-from acwm_planning.planned import SUMMARY as PLAN_SUMMARY
+from acwm_experiment.tasks import PlanCommand
+from acwm_planning.jobs import SUMMARY as PLAN_SUMMARY
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""
@@ -35,19 +35,19 @@ class Step(Job):
     """One command, run here or as a job of a batch system."""
 
     title: str = ""  # readable description of what it does
-    dataset: PlannedDataset | None = None  # for ``simulate`` steps
-    run: PlannedRun | None = None  # for ``train`` and ``evaluate`` steps
-    task: TaskPlan | None = None  # for ``plan`` steps
+    dataset: DatasetSpec | None = None  # for ``simulate`` steps
+    run: RunSpec | None = None  # for ``train`` and ``evaluate`` steps
+    task: PlanCommand | None = None  # for ``plan`` steps
 
     @property
     def size(self) -> tuple[int, str]:
         """How much work it is, with the unit: steps of a training, or episodes of a plan."""
         if self.task:
-            return self.task.planned.episodes, "episodes"
+            return self.task.job.episodes, "episodes"
         return (self.run.max_steps, "steps") if self.run else (0, "")
 
 
-def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
+def all_steps(plan: ExperimentPlan, workers: int | None = None) -> list[Step]:
     """All steps, each after those it needs; simulations use `workers` processes or all cores."""
     steps: dict[str, Step] = {}
     for run in plan.runs:
@@ -76,7 +76,7 @@ def all_steps(plan: Plan, workers: int | None = None) -> list[Step]:
     return [*steps.values(), report]
 
 
-def _planning(task: TaskPlan) -> Step:
+def _planning(task: PlanCommand) -> Step:
     needs, gpus = ((f"train-{task.run.folder.name}",), task.run.gpus) if task.run else ((), 0)
     return Step(
         f"plan-{task.name}",
@@ -84,12 +84,12 @@ def _planning(task: TaskPlan) -> Step:
         ("plan", *task.arguments),
         needs,
         gpus=min(1, gpus),
-        title=f"plan {task.planned.title}",
+        title=f"plan {task.job.title}",
         task=task,
     )
 
 
-def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
+def _simulation(dataset: DatasetSpec, workers: int | None) -> Step:
     choice = dataset.choice
     options = {
         "--episodes": ",".join(map(str, choice.episodes or ())),
@@ -108,10 +108,10 @@ def _simulation(dataset: PlannedDataset, workers: int | None) -> Step:
     )
 
 
-def step_progress(step: Step, plan: Plan) -> float:
+def step_progress(step: Step, plan: ExperimentPlan) -> float:
     """The share of a step's work that is done, in [0, 1].
 
-    See `training_progress` and `PlannedTask.progress`.
+    See `training_progress` and `PlanningJob.progress`.
     """
     if step.dataset:
         return float(dataset_is_whole(step.dataset))
@@ -121,14 +121,14 @@ def step_progress(step: Step, plan: Plan) -> float:
     if step.task:
         run = step.task.run
         ready = run is None or training_progress(run) == 1  # else it will have other weights
-        return step.task.planned.progress() if ready else 0.0
+        return step.task.job.progress() if ready else 0.0
     shown = [plan.folder / FILE, *(run.folder / SUMMARY for run in plan.runs)]
-    shown += [task.planned.folder / PLAN_SUMMARY for task in plan.tasks]
+    shown += [task.job.folder / PLAN_SUMMARY for task in plan.tasks]
     newest = max((path.stat().st_mtime_ns for path in shown if path.exists()), default=0)
     return float(plan.report.exists() and plan.report.stat().st_mtime_ns >= newest)
 
 
-def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, float]:
+def all_progress(steps: Sequence[Step], plan: ExperimentPlan) -> dict[str, float]:
     """`step_progress` of every step, by name; datasets no longer needed count as done."""
     progress = {step.name: step_progress(step, plan) for step in steps}
     needed = {name for step in steps if progress[step.name] < 1 for name in step.needs}
@@ -140,7 +140,7 @@ def all_progress(steps: Sequence[Step], plan: Plan) -> dict[str, float]:
     return progress
 
 
-def dataset_is_whole(dataset: PlannedDataset) -> bool:
+def dataset_is_whole(dataset: DatasetSpec) -> bool:
     """Whether the requested dataset exists; `acwm generate` refuses a folder with another one."""
     if not (dataset.path / CARD).is_file():
         return False
@@ -157,7 +157,7 @@ def dataset_is_whole(dataset: PlannedDataset) -> bool:
     return whole and made == (choice.seed, choice.exploration, {})
 
 
-def training_progress(run: PlannedRun) -> float:
+def training_progress(run: RunSpec) -> float:
     """The share of its steps that a training has done, in [0, 1].
 
     Raises:
@@ -190,7 +190,7 @@ def saved_steps(run: Path) -> int:
         return 0
 
 
-def is_evaluated(run: PlannedRun) -> bool:
+def is_evaluated(run: RunSpec) -> bool:
     """Whether the weights of a finished run were evaluated with its current recipe."""
     summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
     try:
@@ -203,7 +203,7 @@ def is_evaluated(run: PlannedRun) -> bool:
         return False
 
 
-def evaluation_overrides(run: PlannedRun) -> list[str]:
+def evaluation_overrides(run: RunSpec) -> list[str]:
     """Overrides for `acwm evaluate`, so that a run trained earlier is evaluated as asked for now.
 
     Its own recipe may say something else, for example the defaults when it was trained.

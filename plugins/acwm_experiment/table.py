@@ -10,7 +10,7 @@ from pathlib import Path
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.untrusted import parse_json, read_bytes, typed
-from acwm_planning.planned import PlannedTask
+from acwm_planning.jobs import PlanningJob
 
 FILE = "experiment.json"
 
@@ -53,7 +53,7 @@ class Experiment:
     groups: Mapping[str, tuple[str, ...]]
     seeds: tuple[int, ...]  # seeds with which each cell is trained
     cells: tuple[ExperimentCell, ...]  # row by row; a row may lack a column
-    plans: tuple[PlannedTask, ...] = ()  # tasks solved by planning, table by table
+    plans: tuple[PlanningJob, ...] = ()  # tasks solved by planning, table by table
 
     def of_runs(self, runs: Collection[Path]) -> Experiment:
         """The same table with these runs only."""

@@ -12,20 +12,20 @@ from acwm_core.errors import AcwmError, RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_core.training.trained import copy_of, find_run, trained_models
 from acwm_experiment.files import TaskChoice, slug
-from acwm_experiment.runs import PlannedRun
+from acwm_experiment.runs import RunSpec
 from acwm_experiment.table import Experiment
-from acwm_planning.planned import PLANS, PlannedTask
+from acwm_planning.jobs import PLANS, PlanningJob
 from acwm_planning.settings import settings_of
 
 
 @dataclass(frozen=True)
-class TaskPlan:
+class PlanCommand:
     """One call of `acwm plan`."""
 
     name: str  # a name that no other has, fit for a file
-    planned: PlannedTask  # what it makes
+    job: PlanningJob  # what it makes
     arguments: tuple[str, ...]  # the words after `acwm plan`
-    run: PlannedRun | None  # the training that it waits for; None for a run that exists
+    run: RunSpec | None  # the training that it waits for; None for a run that exists
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class _Model:
     results: Path  # run folder for its results
     environment: str
     label: str  # of its row
-    run: PlannedRun | None = None
+    run: RunSpec | None = None
 
 
-def planned_tasks(
+def plan_commands(
     choices: Sequence[TaskChoice],
     experiment: Experiment,
-    runs: Mapping[Path, PlannedRun],
+    runs: Mapping[Path, RunSpec],
     folder: Path,
-) -> tuple[TaskPlan, ...]:
+) -> tuple[PlanCommand, ...]:
     """Find the model of every row, and check its task and settings.
 
     Results with the settings that a task declares are where `acwm plan` leaves them, and others
@@ -60,7 +60,7 @@ def planned_tasks(
     Raises:
         RecipeError: there is no such model, task, setting or row, or two rows are the same.
     """
-    found: dict[str, TaskPlan] = {}
+    found: dict[str, PlanCommand] = {}
     for choice in choices:
         try:
             made = [
@@ -71,14 +71,14 @@ def planned_tasks(
         for each in made:
             if (first := found.setdefault(each.name, each)) is not each:
                 raise RecipeError(
-                    f"{first.planned.title} and {each.planned.title} would both be {each.name}: "
+                    f"{first.job.title} and {each.job.title} would both be {each.name}: "
                     "give them different settings, or leave one out"
                 )
     return tuple(found.values())
 
 
 def _models(
-    choice: TaskChoice, experiment: Experiment, runs: Mapping[Path, PlannedRun]
+    choice: TaskChoice, experiment: Experiment, runs: Mapping[Path, RunSpec]
 ) -> Iterator[_Model]:
     cells = {cell.title: cell for cell in experiment.cells}
     if choice.model not in cells:
@@ -108,7 +108,7 @@ def _environment(folder: Path) -> str:
     return DatasetCard.read(folder / CARD).environment.name
 
 
-def _task_plan(choice: TaskChoice, model: _Model, folder: Path) -> TaskPlan:
+def _task_plan(choice: TaskChoice, model: _Model, folder: Path) -> PlanCommand:
     task = catalog().component("environment", model.environment).load_task(choice.task)
     settings = settings_of(choice.overrides, declared=task.planning)
     rows = settings.rows(choice.rows)
@@ -116,7 +116,7 @@ def _task_plan(choice: TaskChoice, model: _Model, folder: Path) -> TaskPlan:
         raise RecipeError(f"rows={[*choice.rows]}: give one that can be played, such as model")
     name = slug(",".join([f"{Path(model.name).name}-{choice.task}", *choice.overrides]))
     usual = model.results / PLANS / choice.task
-    planned = PlannedTask(
+    job = PlanningJob(
         table=choice.table,
         row=model.label,
         run=model.weights,
@@ -129,8 +129,8 @@ def _task_plan(choice: TaskChoice, model: _Model, folder: Path) -> TaskPlan:
     )
     words = [model.name, choice.task, *choice.overrides, "--seeds", _numbers(choice.seeds)]
     words += [word for row in rows for word in ("--row", row)]
-    words += ["--videos", str(choice.videos), "--out", str(planned.folder)]
-    return TaskPlan(name, planned, tuple(words), model.run)
+    words += ["--videos", str(choice.videos), "--out", str(job.folder)]
+    return PlanCommand(name, job, tuple(words), model.run)
 
 
 def _numbers(seeds: Sequence[int]) -> str:

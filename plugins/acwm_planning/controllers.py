@@ -43,7 +43,7 @@ class Controller(ABC):
         """The next actions."""
 
 
-class Still(Controller):
+class StillController(Controller):
     """Always takes the action that means no motion."""
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
@@ -55,7 +55,7 @@ class Still(Controller):
         return [self._environment.still_action()]
 
 
-class RandomActions(Controller):
+class RandomController(Controller):
     """Uniform random actions within the bounds, each held for one action block of the planner."""
 
     def __init__(self, action_block: int) -> None:
@@ -73,7 +73,7 @@ class RandomActions(Controller):
         return [np.clip(action, low, high)] * self._block
 
 
-class Scripted(Controller):
+class ScriptedController(Controller):
     """The behaviour policy, which does not know the goal, or the task's own solution.
 
     Args:
@@ -132,7 +132,7 @@ class Decision:
     seed: int  # seed of the model's noise
 
 
-class Planned(Controller):
+class PlanningController(Controller):
     """Model-predictive control: plan, execute the first actions of the plan, and plan again.
 
     Args:

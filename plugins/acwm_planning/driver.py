@@ -14,7 +14,7 @@ from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.evaluation.scoring import estimator_for
 from acwm_core.model.shapes import Actions
 from acwm_core.model.world_model import WorldModel
-from acwm_planning.controllers import Planned, Rollouts
+from acwm_planning.controllers import PlanningController, Rollouts
 from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.planner import Cost, Driver, RolloutCost
 from acwm_planning.run import make_cost, make_planner
@@ -52,11 +52,11 @@ class PlanningDriver(Driver):
         rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
         self._card, self._task, self._rollouts = card, task, _Watched(rollouts)
         planner, judge = make_planner(settings), make_cost(settings)
-        self._planned = Planned(planner, self._rollouts, judge, usual=usual)
+        self._controller = PlanningController(planner, self._rollouts, judge, usual=usual)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
         """See `Driver.begin`."""
-        self._planned.aim(self._task, goal, self._card.action, still, seed)
+        self._controller.aim(self._task, goal, self._card.action, still, seed)
 
     def act(
         self,
@@ -67,7 +67,7 @@ class PlanningDriver(Driver):
         """See `Driver.act`: the first actions of a new plan."""
         self._rollouts.check = check
         spec = EpisodeSpec(self._card.name)
-        return self._planned.act(History(spec, list(frames), list(actions)))
+        return self._controller.act(History(spec, list(frames), list(actions)))
 
 
 class _Watched:

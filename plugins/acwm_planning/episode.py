@@ -12,7 +12,7 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import noting
-from acwm_planning.controllers import Controller, Decision, Planned
+from acwm_planning.controllers import Controller, Decision, PlanningController
 from acwm_planning.futures import History
 
 
@@ -63,7 +63,7 @@ class TaskVariant(Task):
 
 
 @dataclass(frozen=True)
-class Played:
+class EpisodeResult:
     """An episode that was played, with its result."""
 
     history: History
@@ -92,7 +92,7 @@ class Played:
         return facts
 
 
-def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> Played:
+def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> EpisodeResult:
     """Play an episode until its task is solved or its time is over.
 
     Raises:
@@ -113,6 +113,6 @@ def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller
                 distances.append(info["distance"])
                 if over := solved or late:
                     break
-    decisions = controller.decisions if isinstance(controller, Planned) else []
+    decisions = controller.decisions if isinstance(controller, PlanningController) else []
     solved, failed = bool(info["success"]), bool(info["failed"])
-    return Played(history, environment.goal, distances, solved, failed, decisions)
+    return EpisodeResult(history, environment.goal, distances, solved, failed, decisions)

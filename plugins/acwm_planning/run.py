@@ -21,12 +21,12 @@ from acwm_core.training.trained import find_run
 from acwm_planning.controllers import (
     Controller,
     NoSolutionError,
-    Planned,
-    RandomActions,
-    Scripted,
-    Still,
+    PlanningController,
+    RandomController,
+    ScriptedController,
+    StillController,
 )
-from acwm_planning.episode import Played, TaskVariant, play
+from acwm_planning.episode import EpisodeResult, TaskVariant, play
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.planner import Cost, Planner
@@ -40,7 +40,7 @@ SPLIT = "ind_test"
 """Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
 
 
-class Bench:
+class EpisodePlayer:
     """Plays episodes of a task with a model and settings, for any row of the table.
 
     Args:
@@ -48,7 +48,7 @@ class Bench:
         task: name of a task of its environment.
         settings: settings of planning.
         device: device of the model; ``"auto"`` takes a GPU if there is one.
-        usual: see `Planned`.
+        usual: see `PlanningController`.
 
     Raises:
         UnknownNameError: there is no such task.
@@ -74,7 +74,7 @@ class Bench:
         self._branches: Environment | None = None
         self._estimator = estimator_for(self.card) if settings.estimates else None
 
-    def play(self, row: str, seed: int) -> tuple[Played, Controller]:
+    def play(self, row: str, seed: int) -> tuple[EpisodeResult, Controller]:
         """Play one episode; returns it with the controller that acted.
 
         Raises:
@@ -92,24 +92,26 @@ class Bench:
         """The controller of a row."""
         planner = make_planner(self.settings)
         if row == "still":
-            return Still()
+            return StillController()
         if row == "random":
-            return RandomActions(getattr(planner, "action_block", planner.actions_per_plan))
+            return RandomController(getattr(planner, "action_block", planner.actions_per_plan))
         if row in ("policy", "solution"):
-            return Scripted(solves=row == "solution")
+            return ScriptedController(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
-        return Planned(planner, rollouts, make_cost(self.settings), usual=self._usual)
+        return PlanningController(planner, rollouts, make_cost(self.settings), usual=self._usual)
 
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
         return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
 
     def write_video(
-        self, folder: Path, row: str, seed: int, played: Played, controller: Controller
+        self, folder: Path, row: str, seed: int, played: EpisodeResult, controller: Controller
     ) -> None:
         """Write a video of what happened and, if the model planned, of what it imagined."""
         expected = None
-        if isinstance(controller, Planned) and isinstance(controller.rollouts, ModelRollouts):
+        if isinstance(controller, PlanningController) and isinstance(
+            controller.rollouts, ModelRollouts
+        ):
             expected = imagined(played, controller.rollouts, controller.still)
         stride, task, fps = self._world.codec.temporal_stride, self.environment.task, self.card.fps
         reader = estimator_for(self.card) if expected is not None else None
@@ -200,12 +202,12 @@ def plan_episodes(
         The table of all episodes in `out`.
 
     Raises:
-        AcwmError: the episodes cannot be played; see `Bench` and `ResumableResults`.
+        AcwmError: the episodes cannot be played; see `EpisodePlayer` and `ResumableResults`.
     """
     weights = RunFolder(run).weights
-    bench = Bench(load_run(run), task, settings, device, usual_actions(run))
-    asked, digest = bench.environment.task, read_metadata(weights).get("sha256")
-    identity = {"environment": bench.card.name, "task": task, "weights": digest}
+    player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))
+    asked, digest = player.environment.task, read_metadata(weights).get("sha256")
+    identity = {"environment": player.card.name, "task": task, "weights": digest}
     # reports recognise the weights by the file's hash
     facts = {"unit": asked.unit, "tolerance": asked.tolerance, "file_sha256": file_sha256(weights)}
     results = ResumableResults(out, {**identity, **settings.to_dict()})
@@ -216,19 +218,19 @@ def plan_episodes(
                 if row in unsolved:
                     continue
                 try:
-                    played, controller = bench.play(row, seed)
+                    played, controller = player.play(row, seed)
                 except NoSolutionError:
                     unsolved.add(row)
                     continue
                 if seed in seeds[:videos]:
-                    bench.write_video(out / VIDEOS, row, seed, played, controller)
+                    player.write_video(out / VIDEOS, row, seed, played, controller)
                 line = {"row": row, "seed": seed, **played.facts()}
                 results.add(line)
                 _show(results, facts)
                 report(line)
             return _show(results, {**facts, "left_out": sorted(unsolved)})
     finally:
-        bench.close()
+        player.close()
 
 
 def _show(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:

@@ -18,7 +18,7 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, judged
 from acwm_core.evaluation import videos
 from acwm_core.model.shapes import Clip
-from acwm_planning.episode import Played
+from acwm_planning.episode import EpisodeResult
 from acwm_planning.futures import History, ModelRollouts
 
 PANEL = 192
@@ -83,7 +83,9 @@ class EpisodeCurves:
     plans: list[PlannedDistances]
 
 
-def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Imagined:
+def imagined(
+    played: EpisodeResult, rollouts: ModelRollouts, still: NDArray[np.float32]
+) -> Imagined:
     """What the model predicted for the actions that were taken, and for those that were planned."""
     history, decisions = played.history, played.decisions
     first = torch.from_numpy(history.frames[0]).permute(2, 0, 1)[None].float() / 255
@@ -102,7 +104,7 @@ def imagined(played: Played, rollouts: ModelRollouts, still: NDArray[np.float32]
 def episode_curves(
     row: str,
     seed: int,
-    played: Played,
+    played: EpisodeResult,
     task: Task,
     fps: int,
     expected: Imagined | None = None,
@@ -147,7 +149,9 @@ def episode_curves(
     )
 
 
-def write_episode(path: Path, played: Played, record: EpisodeCurves, expected: Clip | None) -> None:
+def write_episode(
+    path: Path, played: EpisodeResult, record: EpisodeCurves, expected: Clip | None
+) -> None:
     """Write an episode as MP4, panel by panel, and its curves as a JSON file next to it."""
     happened = np.stack(played.history.frames)
     goal = np.broadcast_to(played.goal.frame, happened.shape)

@@ -14,7 +14,7 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import sentence
 from acwm_core.evaluation.metric import Metric, Rollout
 from acwm_core.plugins import catalog
-from acwm_play.simulator import Moment
+from acwm_play.simulator import TimeStep
 
 METRICS = ("position_error", "height_error", "mask_iou")
 """Metrics to measure, if they are installed and available for the world."""
@@ -74,13 +74,13 @@ class Instruments:
             for name, metric in self._metrics.items()
         }
 
-    def read(self, seen: NDArray[np.uint8], truth: Moment, floor: bool = False) -> Figures:
+    def read(self, seen: NDArray[np.uint8], truth: TimeStep, floor: bool = False) -> Figures:
         """Compare a frame `[H, W, 3]` from the model with the simulator's truth."""
         predicted = self._rollout(seen, truth)
         floors = self._scores(self._rollout(truth.frame, truth)) if floor else {}
         return Figures(self._scores(predicted), floors, self._missing(predicted))
 
-    def _rollout(self, frame: NDArray[np.uint8], truth: Moment) -> Rollout:
+    def _rollout(self, frame: NDArray[np.uint8], truth: TimeStep) -> Rollout:
         pictures = torch.from_numpy(np.stack([frame, truth.frame])).permute(0, 3, 1, 2) / 255
         return Rollout(
             prediction=pictures[:1],

@@ -131,9 +131,9 @@ class Pointing:
         stills: list[NDArray[np.float64]] = []
         bodies: list[NDArray[np.float64]] = []
         for index in range(SAMPLES):
-            moment = simulator.start(Scene(index))[0]
+            time_step = simulator.start(Scene(index))[0]
             stills.append(np.asarray(given.still_action(), np.float64))
-            rows = [r.of(moment.state) for r in physics.readings if r.kind == "position"]
+            rows = [r.of(time_step.state) for r in physics.readings if r.kind == "position"]
             bodies.append(np.concatenate([r.reshape(-1, r.shape[-1])[:, :2] for r in rows]))
         maps = [
             _fitted(np.stack(bodies, 1), np.stack(stills)[:, i : i + 2])

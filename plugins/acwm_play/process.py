@@ -16,7 +16,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal
 from acwm_core.errors import PluginError, RecipeError, sentence
 from acwm_play.layout import Pointing, physics_of
-from acwm_play.simulator import Moment, Scene, Simulator, Standing
+from acwm_play.simulator import Scene, Simulator, TaskProgress, TimeStep
 
 PATIENCE = 5.0
 """Seconds to wait for a process to end before it is killed."""
@@ -61,19 +61,19 @@ class SimulatorProcess:
             raise
         return made
 
-    async def start(self, scene: Scene, frames: int) -> list[Moment]:
+    async def start(self, scene: Scene, frames: int) -> list[TimeStep]:
         """See `Simulator.start`."""
         return await self._do(self._ask, "start", scene, frames)
 
-    async def step(self, action: NDArray[np.float32]) -> Moment:
+    async def step(self, action: NDArray[np.float32]) -> TimeStep:
         """See `Simulator.step`."""
         return await self._do(self._ask, "step", action)
 
-    async def step_by_policy(self, anew: bool) -> Moment:
+    async def step_by_policy(self, anew: bool) -> TimeStep:
         """See `Simulator.step_by_policy`."""
         return await self._do(self._ask, "step_by_policy", anew)
 
-    async def aim(self, task: str) -> tuple[Goal, Standing]:
+    async def aim(self, task: str) -> tuple[Goal, TaskProgress]:
         """See `Simulator.aim`."""
         return await self._do(self._ask, "aim", task)
 

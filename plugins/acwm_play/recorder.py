@@ -23,7 +23,7 @@ from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import OtherDatasetError
 from acwm_core.evaluation.videos import join, magnification, panels
 from acwm_core.plugins import catalog
-from acwm_play.simulator import Moment
+from acwm_play.simulator import TimeStep
 
 MAX_FRAMES = 1201
 """Largest number of frames in a recording: two minutes at ten frames per second."""
@@ -41,34 +41,34 @@ class Recording:
     """A recording in progress.
 
     Attributes:
-        moments: the simulator's data of each frame.
+        time_steps: the simulator's data of each frame.
         dreamt: the model's frames, `[H, W, 3]` uint8 each.
     """
 
-    moments: list[Moment] = field(default_factory=list[Moment])
+    time_steps: list[TimeStep] = field(default_factory=list[TimeStep])
     dreamt: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
 
     @property
     def frames(self) -> int:
         """Number of frames."""
-        return len(self.moments)
+        return len(self.time_steps)
 
     def episode(self, spec: EpisodeSpec) -> Episode:
         """The episode, with all data from the simulator."""
-        states = [moment.state for moment in self.moments]
+        states = [time_step.state for time_step in self.time_steps]
         contacts = [
-            (index, *pair) for index, each in enumerate(self.moments) for pair in each.contacts
+            (index, *pair) for index, each in enumerate(self.time_steps) for pair in each.contacts
         ]
-        taken = [moment.action for moment in self.moments]
+        taken = [time_step.action for time_step in self.time_steps]
         return Episode(
             spec=spec,
-            video=np.stack([moment.frame for moment in self.moments]),
+            video=np.stack([time_step.frame for time_step in self.time_steps]),
             actions=np.stack([*taken[1:], np.zeros_like(taken[0])]),
             states={name: np.stack([state[name] for state in states]) for name in states[0]},
-            masks=np.stack([moment.mask for moment in self.moments]),
+            masks=np.stack([time_step.mask for time_step in self.time_steps]),
             contacts=np.array(contacts, np.int32).reshape(-1, 3),
-            factors=self.moments[0].factors,
-            ood_label=self.moments[0].ood_label,
+            factors=self.time_steps[0].factors,
+            ood_label=self.time_steps[0].ood_label,
         )
 
 
@@ -91,7 +91,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
     video = out / f"{folder.name}-{index:06d}.mp4"
     true, dreamt = (
         torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255
-        for frames in ([moment.frame for moment in recording.moments], recording.dreamt)
+        for frames in ([time_step.frame for time_step in recording.time_steps], recording.dreamt)
     )
     with writing(video):
         write_mp4(video, join(panels(true, dreamt)), card.fps, magnification(height))

@@ -15,8 +15,8 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from acwm_core.errors import DataError
 from acwm_play.address import HOST, listening, token
-from acwm_play.house import House
 from acwm_play.messages import MAX_MESSAGE, parse
+from acwm_play.pool import WorldPool
 from acwm_play.session import Session
 from acwm_play.worlds import World
 
@@ -51,13 +51,13 @@ class Server:
     """The routes of one server.
 
     Args:
-        house: shared by all sessions.
+        pool: shared by all sessions.
         out: folder for recordings.
         secret: the token; the first part of every path.
     """
 
-    def __init__(self, house: House, out: Path, secret: str) -> None:
-        self._house, self._out, self.secret = house, out, secret
+    def __init__(self, pool: WorldPool, out: Path, secret: str) -> None:
+        self._pool, self._out, self.secret = pool, out, secret
         self._sockets: dict[web.WebSocketResponse, asyncio.Task[None]] = {}
 
     def application(self) -> web.Application:
@@ -118,7 +118,7 @@ class Server:
     async def _played(self, socket: web.WebSocketResponse) -> None:
         """Play until the page leaves, sends an invalid message, or something fails."""
         more = asyncio.Event()
-        session = Session(self._house, self._out, more)
+        session = Session(self._pool, self._out, more)
         parts = [_hear(socket, session), _speak(socket, session, more), session.run()]
         tasks = [asyncio.ensure_future(part) for part in parts]
         try:
@@ -177,20 +177,20 @@ def serve(
     Raises:
         AcwmError: the port is taken, or the first world cannot be played.
     """
-    house = House(worlds, steps)
-    server = Server(house, out, token())
+    pool = WorldPool(worlds, steps)
+    server = Server(pool, out, token())
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(house, server, port, browser))
+        asyncio.run(_serve(pool, server, port, browser))
 
 
-async def _serve(house: House, server: Server, port: int | None, browser: bool) -> None:
+async def _serve(pool: WorldPool, server: Server, port: int | None, browser: bool) -> None:
     socket = listening(port)
     runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=5)
     ended = asyncio.Event()
     with contextlib.suppress(NotImplementedError):
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ended.set)
     try:
-        await house.rehearse()
+        await pool.warm_up()
         await runner.setup()
         await web.SockSite(runner, socket).start()
         address = f"http://{HOST}:{socket.getsockname()[1]}/{server.secret}/"
@@ -200,5 +200,5 @@ async def _serve(house: House, server: Server, port: int | None, browser: bool) 
         await ended.wait()
     finally:
         await runner.cleanup()
-        await house.close()
+        await pool.close()
         socket.close()

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import AcwmError, is_for_users, sentence
 from acwm_play import messages
+from acwm_play.action_source import PERSON, ActionSource
 from acwm_play.clock import SPEEDS, Clock
 from acwm_play.figures import pixel_error
-from acwm_play.house import House
+from acwm_play.live_world import LiveWorld
 from acwm_play.messages import Outbox, Wish, pack
+from acwm_play.pool import WorldPool
 from acwm_play.recorder import MAX_FRAMES, Recording, save
-from acwm_play.simulator import Moment, Scene
-from acwm_play.stage import Stage
-from acwm_play.wheel import PERSON, Wheel
+from acwm_play.simulator import Scene, TimeStep
 
 REST = 2.0
 """How long instruments pause, relative to the time they worked, because frames come first."""
@@ -36,20 +36,20 @@ class Session:
     """Plays until it is cancelled; all messages for the page go to its `outbox`.
 
     Args:
-        house: shared by all sessions.
+        pool: shared by all sessions.
         out: folder for recordings.
         more: event that is set whenever something was put into the outbox.
     """
 
-    def __init__(self, house: House, out: Path, more: asyncio.Event) -> None:
-        self._house, self._out, self._more = house, out, more
+    def __init__(self, pool: WorldPool, out: Path, more: asyncio.Event) -> None:
+        self._pool, self._out, self._more = pool, out, more
         self.outbox = Outbox()
         self._clock = Clock(10)
-        self._wheel = Wheel(self._tell)
-        self._stage: Stage | None = None
+        self._source = ActionSource(self._tell)
+        self._live: LiveWorld | None = None
         self._wanted: messages.Open | None = None
         self._take_over = False
-        self._last: tuple[Moment, NDArray[np.uint8]] | None = None
+        self._last: tuple[TimeStep, NDArray[np.uint8]] | None = None
         self._alone = 0
         self._recording: Recording | None = None
         self._keep_recording = False
@@ -66,7 +66,7 @@ class Session:
     def wish(self, wish: Wish) -> None:
         """Note what the page asks for; the loop acts on it with the next frame."""
         if isinstance(wish, messages.Act | messages.Point):
-            self._wheel.hold(wish)
+            self._source.hold(wish)
         else:
             self._note(wish)
             self._wake.set()
@@ -85,7 +85,7 @@ class Session:
             case messages.Speed(value) if value in SPEEDS:
                 self._clock.speed = value
             case messages.Drive(by, task):
-                self._wheel.hand_to(by, task)
+                self._source.hand_to(by, task)
             case messages.Record(on):
                 self._keep_recording = on
             case _:
@@ -106,7 +106,7 @@ class Session:
                         raise
                     self._tell("notice", text=sentence(error), wrong=True)
                     self._predicting = None
-                    self._wheel.stop()
+                    self._source.stop()
                     await self._save()
                     while self._wanted is None:
                         await self._asked()
@@ -115,19 +115,19 @@ class Session:
 
     async def _go_on(self) -> None:
         """Do the next thing: what the page asks for, or the next latent frame."""
-        if self._wanted is not None or self._stage is None:
+        if self._wanted is not None or self._live is None:
             await self._open(self._wanted or messages.Open())
         elif self._take_over:
             await self._start_over()
         elif self._keep_recording != (self._recording is not None):
             await self._settled()
             await self._heed_recording()
-        elif not await self._ready(self._stage):
+        elif not await self._ready(self._live):
             pass  # it was waited for, and the page may have asked for something
-        elif (self._clock.paused and not self._step) or self._wheel.over:
+        elif (self._clock.paused and not self._step) or self._source.over:
             await self._asked()
         else:
-            await self._latent_frame(self._stage)
+            await self._latent_frame(self._live)
 
     async def _asked(self) -> None:
         """Wait until the page asks for something."""
@@ -136,69 +136,69 @@ class Session:
 
     async def _open(self, wanted: messages.Open) -> None:
         self._wanted, self._take_over = None, False
-        self._wheel.stop()
+        self._source.stop()
         with contextlib.suppress(Exception):  # it was shown
             await self._settled()
         await self._save()
-        stage, before = await self._set_up(wanted.world)
+        live, before = await self._set_up(wanted.world)
         factors = wanted.factors
         scene = Scene.drawn(factors) if wanted.index is None else Scene(wanted.index, factors)
         try:
-            moment, seen = await stage.begin(scene)
+            time_step, seen = await live.begin(scene)
         except Exception as error:
             if before is None or not is_for_users(error):
                 raise
             self._tell("notice", text=sentence(error), wrong=True)
-            moment, seen = await stage.begin(before)  # the last scene that worked
-        self._wheel.begin(stage)
+            time_step, seen = await live.begin(before)  # the last scene that worked
+        self._source.begin(live)
         self.outbox.forget_frames()
-        resting = await stage.resting()
-        self._tell("world", **stage.about(moment), **resting, menu=self._house.menu())
-        self._began(moment, seen)
+        resting = await live.resting()
+        self._tell("world", **live.about(time_step), **resting, menu=self._pool.menu())
+        self._began(time_step, seen)
 
-    async def _set_up(self, name: str | None) -> tuple[Stage, Scene | None]:
-        """The stage of a world (by default the same one), and the scene that it currently shows."""
-        stage = self._stage
-        world = self._house.worlds.get(name or "") or (stage.world if stage else None)
-        world = world or next(iter(self._house.worlds.values()))
-        if stage is not None and stage.world == world and stage.simulator.alive:
-            return stage, stage.scene
+    async def _set_up(self, name: str | None) -> tuple[LiveWorld, Scene | None]:
+        """A running world (by default the same one), and the scene that it currently shows."""
+        live = self._live
+        world = self._pool.worlds.get(name or "") or (live.world if live else None)
+        world = world or next(iter(self._pool.worlds.values()))
+        if live is not None and live.world == world and live.simulator.alive:
+            return live, live.scene
         self._tell("busy", text=f"Setting up {world.name} …")
-        self._stage = None
-        if stage is not None:
-            await self._house.give_back(stage)
-        made = await self._house.stage(world)
-        self._stage, self._clock.fps = made, made.simulator.card.fps
+        self._live = None
+        if live is not None:
+            await self._pool.release(live)
+        made = await self._pool.acquire(world)
+        self._live, self._clock.fps = made, made.simulator.card.fps
         return made, None
 
     async def _start_over(self) -> None:
-        assert self._stage is not None
+        assert self._live is not None
         self._take_over = False
         await self._settled()
-        self._began(self._stage.recent[-1], await self._stage.take_over())
+        self._began(self._live.recent[-1], await self._live.take_over())
 
-    def _began(self, moment: Moment, seen: NDArray[np.uint8]) -> None:
+    def _began(self, time_step: TimeStep, seen: NDArray[np.uint8]) -> None:
         """Show the start, where simulator and model show the same."""
-        self._last, self._alone = (moment, seen), 0
-        self._show([moment], seen[None], [self._wheel.seq])
+        self._last, self._alone = (time_step, seen), 0
+        self._show([time_step], seen[None], [self._source.seq])
         self._tell_state()
 
-    async def _latent_frame(self, stage: Stage) -> None:
+    async def _latent_frame(self, live: LiveWorld) -> None:
         """Simulate one latent frame; the model predicts it while the next one is simulated."""
         self._step = False
-        moments: list[Moment] = []
+        time_steps: list[TimeStep] = []
         seqs: list[int] = []
         began = time.monotonic()
-        while len(moments) < stage.dream.stride:
+        while len(time_steps) < live.dream.stride:
             await self._clock.tick()
             if self._wanted is not None:
                 return
-            if await self._ready(stage):
-                seqs.append(self._wheel.seq)
-                moments.append(await self._wheel.act(stage))
+            if await self._ready(live):
+                seqs.append(self._source.seq)
+                time_steps.append(await self._source.act(live))
         await self._settled()
-        self._pace = (time.monotonic() - began) / len(moments)
-        self._predicting = asyncio.create_task(self._predict(stage, moments, seqs))
+        self._pace = (time.monotonic() - began) / len(time_steps)
+        self._predicting = asyncio.create_task(self._predict(live, time_steps, seqs))
 
     async def _settled(self) -> None:
         """Wait until the running prediction has ended.
@@ -210,23 +210,23 @@ class Session:
         if task is not None:
             await task
 
-    async def _predict(self, stage: Stage, moments: list[Moment], seqs: list[int]) -> None:
-        seen = await stage.predict([moment.action for moment in moments])
-        self._alone += len(moments)
+    async def _predict(self, live: LiveWorld, time_steps: list[TimeStep], seqs: list[int]) -> None:
+        seen = await live.predict([time_step.action for time_step in time_steps])
+        self._alone += len(time_steps)
         if self._recording:
-            self._recording.moments += moments
+            self._recording.time_steps += time_steps
             self._recording.dreamt += [*seen]
             if self._recording.frames >= MAX_FRAMES:
                 self._keep_recording = False
-        self._last = moments[-1], seen[-1]
-        self._show(moments, seen, seqs)
+        self._last = time_steps[-1], seen[-1]
+        self._show(time_steps, seen, seqs)
         if self._reading is None or self._reading.done():
-            self._reading = asyncio.create_task(self._read(stage, moments[-1], seen[-1]))
+            self._reading = asyncio.create_task(self._read(live, time_steps[-1], seen[-1]))
 
-    async def _ready(self, stage: Stage) -> bool:
+    async def _ready(self, live: LiveWorld) -> bool:
         """Whether the next action is known; if not, wait until a driver has planned it."""
         try:
-            return await self._wheel.ready(stage, self._wake)
+            return await self._source.ready(live, self._wake)
         except Exception as error:
             if not is_for_users(error):
                 raise
@@ -245,39 +245,39 @@ class Session:
             "state",
             paused=self._clock.paused,
             speed=self._clock.speed,
-            driver=self._wheel.driver,
+            driver=self._source.driver,
             recording=self._keep_recording,
         )
 
-    def _show(self, moments: list[Moment], seen: NDArray[np.uint8], seqs: list[int]) -> None:
-        stage, standing = self._stage, moments[-1].standing
-        assert stage is not None
+    def _show(self, time_steps: list[TimeStep], seen: NDArray[np.uint8], seqs: list[int]) -> None:
+        live, progress = self._live, time_steps[-1].progress
+        assert live is not None
         header = {
             "seqs": seqs,
-            "alone": self._alone / stage.simulator.card.fps,
+            "alone": self._alone / live.simulator.card.fps,
             "pace": self._pace,
-            "pixel_error": pixel_error(seen[-1], moments[-1].frame),
-            "spread": stage.dream.spread,
+            "pixel_error": pixel_error(seen[-1], time_steps[-1].frame),
+            "spread": live.dream.spread,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
-            "standing": dataclasses.asdict(standing) if standing else None,
-            "places": None if self._wheel.driver == PERSON else stage.places(moments[-1].action),
+            "progress": dataclasses.asdict(progress) if progress else None,
+            "places": None if self._source.driver == PERSON else live.places(time_steps[-1].action),
         }
-        self.outbox.put_frames(pack(header, np.stack([m.frame for m in moments]), seen))
+        self.outbox.put_frames(pack(header, np.stack([m.frame for m in time_steps]), seen))
         self._more.set()
 
-    async def _read(self, stage: Stage, moment: Moment, seen: NDArray[np.uint8]) -> None:
-        alone, scene, began = self._alone / stage.simulator.card.fps, stage.scene, time.monotonic()
+    async def _read(self, live: LiveWorld, time_step: TimeStep, seen: NDArray[np.uint8]) -> None:
+        alone, scene, began = self._alone / live.simulator.card.fps, live.scene, time.monotonic()
         floor = scene is not self._floor_of
-        run = self._house.workers.run
+        run = self._pool.workers.run
         try:
-            read = await run("instruments", stage.instruments.read, seen, moment, floor)
+            read = await run("instruments", live.instruments.read, seen, time_step, floor)
         except Exception as error:
             if not is_for_users(error):
                 raise
             self._tell("notice", text=sentence(error), wrong=True)
             return
-        if stage is self._stage and scene is stage.scene:
+        if live is self._live and scene is live.scene:
             self._floor_of, self._floors = scene, read.floors or self._floors
             self._tell("figures", alone=alone, **{**read._asdict(), "floors": self._floors})
         await asyncio.sleep(REST * (time.monotonic() - began))
@@ -294,11 +294,11 @@ class Session:
     async def _save(self) -> None:
         """Save the recording of this scene; recording continues with the next scene."""
         recording, self._recording = self._recording, None
-        if recording is None or self._stage is None or recording.frames < 2:
+        if recording is None or self._live is None or recording.frames < 2:
             return
-        card = self._stage.simulator.card
+        card = self._live.simulator.card
         try:
-            saved = await self._house.workers.run("disk", save, recording, card, self._out)
+            saved = await self._pool.workers.run("disk", save, recording, card, self._out)
         except (AcwmError, OSError) as error:
             self._keep_recording = False
             self._tell("notice", text=f"Not saved: {error}", wrong=True)
@@ -310,12 +310,12 @@ class Session:
         self._tell_state()
 
     async def _close(self) -> None:
-        self._wheel.stop()
+        self._source.stop()
         for task in (self._predicting, self._reading):
             if task:
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError, AcwmError):
                     await task
         await self._save()
-        if self._stage:
-            await self._house.give_back(self._stage)
+        if self._live:
+            await self._pool.release(self._live)

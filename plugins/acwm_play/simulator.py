@@ -40,7 +40,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Standing:
+class TaskProgress:
     """How a frame stands to the goal.
 
     Attributes:
@@ -55,7 +55,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Moment:
+class TimeStep:
     """Everything that the simulator knows about one frame.
 
     Attributes:
@@ -66,7 +66,7 @@ class Moment:
         factors: the value of every factor.
         ood_label: the factors whose values lie outside the training range, or None.
         action: the raw action `[A]` that led to this frame; zeros at the start.
-        standing: how it stands to the goal, if there is one.
+        progress: how far the goal is, if there is one.
     """
 
     frame: NDArray[np.uint8]
@@ -76,7 +76,7 @@ class Moment:
     factors: Mapping[str, FactorValue]
     ood_label: str | None
     action: NDArray[np.float32]
-    standing: Standing | None = None
+    progress: TaskProgress | None = None
 
 
 class Simulator:
@@ -99,7 +99,7 @@ class Simulator:
         self._aiming: TaskEnvironment | None = None
         self._solved = False
 
-    def start(self, scene: Scene, frames: int = 1) -> list[Moment]:
+    def start(self, scene: Scene, frames: int = 1) -> list[TimeStep]:
         """Build a scene and hold still for `frames` frames, as many as a model is given.
 
         Raises:
@@ -110,20 +110,20 @@ class Simulator:
             frame, info = self.environment.reset(options={"spec": spec})
         self._spec, self._policy = spec, None
         self._goals, self._aiming = {}, None
-        moments = [self._moment(frame, info, np.zeros(self.card.action.size, np.float32))]
-        return moments + [self.step(self.still()) for _ in range(frames - 1)]
+        time_steps = [self._time_step(frame, info, np.zeros(self.card.action.size, np.float32))]
+        return time_steps + [self.step(self.still()) for _ in range(frames - 1)]
 
-    def step(self, action: NDArray[np.float32]) -> Moment:
+    def step(self, action: NDArray[np.float32]) -> TimeStep:
         """Advance by one frame; the action is clipped to its bounds."""
         action_spec = self.card.action
         low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
         taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
         with noting("while playing", self.environment):
             frame, _, _, _, info = (self._aiming or self.environment).step(taken)
-        return self._moment(frame, info, taken)
+        return self._time_step(frame, info, taken)
 
-    def aim(self, task: str) -> tuple[Goal, Standing]:
-        """Set the goal of a task in this scene; from now on, moments say how they stand to it.
+    def aim(self, task: str) -> tuple[Goal, TaskProgress]:
+        """Set the goal of a task in this scene; from now on, time steps say how they stand to it.
 
         It is drawn once per scene, in a second environment, because drawing moves things.
 
@@ -144,13 +144,13 @@ class Simulator:
             self._aiming.goal = self._goals[task]
             _, info = self.environment.observe()
             self._aiming.judge(info)
-        return self._aiming.goal, self._standing(info)
+        return self._aiming.goal, self._progress(info)
 
     def still(self) -> NDArray[np.float32]:
         """The action that means no motion."""
         return self.environment.still_action()
 
-    def step_by_policy(self, anew: bool) -> Moment:
+    def step_by_policy(self, anew: bool) -> TimeStep:
         """Advance by one frame with the behaviour policy; `anew` restarts the policy from here."""
         with noting("while its policy drives", self.environment):
             if self._policy is None or anew:
@@ -166,13 +166,13 @@ class Simulator:
             if each is not None:
                 each.close()
 
-    def _moment(
+    def _time_step(
         self, frame: NDArray[np.uint8], info: Mapping[str, Any], action: NDArray[np.float32]
-    ) -> Moment:
+    ) -> TimeStep:
         names = ("mask", "state", "contacts", "factors", "ood_label")
-        standing = self._standing(info) if self._aiming else None
-        return Moment(frame, **{n: info[n] for n in names}, action=action, standing=standing)
+        progress = self._progress(info) if self._aiming else None
+        return TimeStep(frame, **{n: info[n] for n in names}, action=action, progress=progress)
 
-    def _standing(self, info: Mapping[str, Any]) -> Standing:
+    def _progress(self, info: Mapping[str, Any]) -> TaskProgress:
         self._solved = self._solved or info["success"]
-        return Standing(info["distance"], self._solved, info["failed"])
+        return TaskProgress(info["distance"], self._solved, info["failed"])

@@ -10,7 +10,7 @@ from pathlib import Path
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.untrusted import read_bytes
-from acwm_planning.planned import PLANS
+from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
 from acwm_report.run import DAMAGE, clips_title

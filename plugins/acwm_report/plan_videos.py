@@ -11,7 +11,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from acwm_core.untrusted import read_bytes, read_json
-from acwm_report.plans import distance_scale, planned
+from acwm_report.plans import distance_scale, plan_results
 from acwm_report.run import EvaluatedRun, result_files
 
 VIDEOS = "videos"
@@ -175,7 +175,7 @@ def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[Plan
     return [
         [
             video
-            for number, (folder, table) in enumerate(planned(run).items())
+            for number, (folder, table) in enumerate(plan_results(run).items())
             for video in room.take(run.folder, folder, table.task, f"{run.key}-plan{number}")
         ]
         for run in runs

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from acwm_core.evaluation.results import Estimate
 from acwm_core.untrusted import read_json
-from acwm_planning.planned import PLANS, SUMMARY
+from acwm_planning.jobs import PLANS, SUMMARY
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.score_grid import MISSING, Cell, Column, Scale
 from acwm_report.table import Row, Table
@@ -76,7 +76,7 @@ def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
     return {path: each for path, each in found.items() if each.file_sha256 == weights}
 
 
-def planned(run: EvaluatedRun) -> dict[Path, PlanTable]:
+def plan_results(run: EvaluatedRun) -> dict[Path, PlanTable]:
     """The plan tables made with the evaluated weights; see `plan_tables_of`."""
     return plan_tables_of(run.folder, run.summary.provenance["weights_sha256"])
 
@@ -89,7 +89,7 @@ def distance_scale(unit: str) -> Scale:
 def plan_tables(run: EvaluatedRun) -> list[Table]:
     """Per task: success and final distance of each way to act, on the same episodes."""
     tables: list[Table] = []
-    for found in planned(run).values():
+    for found in plan_results(run).values():
         scale = distance_scale(found.unit)
         columns = [
             *COLUMNS,
@@ -97,13 +97,13 @@ def plan_tables(run: EvaluatedRun) -> list[Table]:
             Column("At the start", scale.unit),
             *LAST,
         ]
-        rows = [planned_row(each, scale) for each in found.rows]
+        rows = [plan_row(each, scale) for each in found.rows]
         head = f"{found.task} · {max((each.episodes for each in found.rows), default=0)} episodes"
         tables.append(Table(head, columns, rows, "Who acts", CAPTION, f"plans-{found.task}"))
     return tables
 
 
-def planned_row(found: PlannedRow, scale: Scale) -> Row:
+def plan_row(found: PlannedRow, scale: Scale) -> Row:
     """A line of a table with `COLUMNS`, final distance, distance at the start and `LAST`."""
     title, note = ROWS.get(found.row, (found.row, ""))
     seconds = found.seconds_per_decision

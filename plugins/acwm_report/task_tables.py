@@ -8,9 +8,9 @@ from itertools import groupby
 
 from acwm_core.untrusted import read_json
 from acwm_experiment.table import Experiment
-from acwm_planning.planned import SUMMARY, PlannedTask
+from acwm_planning.jobs import SUMMARY, PlanningJob
 from acwm_report.plan_videos import PlanVideo, VideoRoom
-from acwm_report.plans import CAPTION, COLUMNS, LAST, PlanTable, distance_scale, planned_row
+from acwm_report.plans import CAPTION, COLUMNS, LAST, PlanTable, distance_scale, plan_row
 from acwm_report.run import EvaluatedRun
 from acwm_report.score_grid import Cell, Column, Scale
 from acwm_report.table import Row, Table
@@ -62,10 +62,10 @@ def task_videos(
     return [(title, videos) for title, videos in found if videos]
 
 
-def _rows(plan: PlannedTask) -> list[Row]:
+def _rows(plan: PlanningJob) -> list[Row]:
     found = read_json(plan.folder / SUMMARY, PlanTable, "a table of plans")
     scale = distance_scale(found.unit)
-    asked = [planned_row(each, scale) for each in found.rows if each.row in plan.rows]
+    asked = [plan_row(each, scale) for each in found.rows if each.row in plan.rows]
     return [
         replace(
             row,

@@ -12,7 +12,7 @@ from acwm_experiment.files import read_experiment
 from acwm_experiment.plan import make_plan
 from acwm_experiment.steps import all_steps
 from acwm_experiment.table import Experiment
-from acwm_planning.planned import PlannedTask
+from acwm_planning.jobs import PlanningJob
 from acwm_planning.settings import settings_of
 from tests.experiment.parts import write_experiment
 from tests.folders import wait_until
@@ -121,7 +121,7 @@ def test_only_these_weights_settings_rows_and_seeds_count(tmp_path):
     (tmp_path / "summary.json").write_text(json.dumps(about))
 
     def share(rows, seeds, **settings_of_it):
-        task = PlannedTask("", "", tmp_path, "square", "corner",
+        task = PlanningJob("", "", tmp_path, "square", "corner",
                            settings | settings_of_it, rows, seeds, tmp_path)  # fmt: skip
         return task.progress()
 

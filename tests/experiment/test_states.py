@@ -12,7 +12,7 @@ from acwm_core.errors import DataError, TrainingError
 from acwm_core.recipe import Recipe
 from acwm_experiment.files import DataChoice, read_experiment
 from acwm_experiment.plan import make_plan
-from acwm_experiment.runs import PlannedDataset
+from acwm_experiment.runs import DatasetSpec
 from acwm_experiment.steps import (
     all_progress,
     all_steps,
@@ -72,7 +72,7 @@ def test_a_dataset_counts_when_it_is_the_one_and_whole(made, tmp_path):
 
 
 def test_a_split_that_is_missing_is_made(tmp_path):
-    data = PlannedDataset(tmp_path / "data", "drift", DataChoice((2, 1, 0)))
+    data = DatasetSpec(tmp_path / "data", "drift", DataChoice((2, 1, 0)))
     generate("drift", data.path, episodes={"train": 2}, workers=0, progress=False)
     assert not dataset_is_whole(data)
     generate("drift", data.path, episodes={"ind_test": 1}, workers=0, progress=False)
@@ -142,7 +142,7 @@ def test_only_what_is_missing_is_left(made):
 
 
 def test_data_that_nothing_needs_any_more_is_not_made_again(made):
-    gone = PlannedDataset(made.folder / "gone", "drift", DataChoice((8, 2, 2)))
+    gone = DatasetSpec(made.folder / "gone", "drift", DataChoice((8, 2, 2)))
     runs = tuple(replace(run, dataset=gone) for run in made.runs)
     first, both = replace(made, runs=runs[:1]), replace(made, runs=runs)
     for plan, done in ((first, True), (both, False)):

@@ -6,7 +6,7 @@ import pytest
 from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
-from acwm_planning.controllers import Planned
+from acwm_planning.controllers import PlanningController
 from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.planner import Driver
 from acwm_planning.run import make_cost, make_planner
@@ -50,7 +50,9 @@ def test_it_decides_as_acwm_plan_does(bundle, driver, history):
     seen, goal, still = history
     settings = settings_of([], declared=FEW)
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None, **settings.rollouts())
-    planned = Planned(make_planner(settings), rollouts, make_cost(settings), usual=[0.5, 0.5])
+    planned = PlanningController(
+        make_planner(settings), rollouts, make_cost(settings), usual=[0.5, 0.5]
+    )
     planned.aim(Quick(), goal, bundle.card.action, still, 7)
     driver.begin(goal, still, 7)
     checks = []

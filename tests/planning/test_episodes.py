@@ -9,7 +9,13 @@ import torch
 
 from acwm_core.data.simulate import simulate
 from acwm_core.errors import RecipeError
-from acwm_planning.controllers import NoSolutionError, Planned, RandomActions, Scripted, Still
+from acwm_planning.controllers import (
+    NoSolutionError,
+    PlanningController,
+    RandomController,
+    ScriptedController,
+    StillController,
+)
 from acwm_planning.costs import StateDistance
 from acwm_planning.episode import TaskVariant, play
 from acwm_planning.futures import History
@@ -22,7 +28,9 @@ SMALL = {"candidates": 24, "iterations": 3, "elites": 4, "horizon": 4, "action_b
 
 def planner(kind=ImprovedCrossEntropy, seed=0, task=tiny.PLACE, **params):
     rollouts = SimulatorRollouts(tiny.Slide(), stride=2)
-    return Planned(kind(**{**SMALL, **params}), rollouts, StateDistance(frames=None), seed)
+    return PlanningController(
+        kind(**{**SMALL, **params}), rollouts, StateDistance(frames=None), seed
+    )
 
 
 def played(controller, seed, task=tiny.PLACE):
@@ -31,7 +39,7 @@ def played(controller, seed, task=tiny.PLACE):
 
 def test_planning_in_the_simulator_gets_there_and_doing_nothing_does_not():
     planned = [played(planner(), seed) for seed in range(6)]
-    nothing = [played(Still(), seed) for seed in range(6)]
+    nothing = [played(StillController(), seed) for seed in range(6)]
     assert [each.success for each in planned] == [True] * 6
     assert [each.success for each in nothing] == [False] * 6
     for plan, still in zip(planned, nothing, strict=True):
@@ -62,9 +70,9 @@ def test_planning_in_the_simulator_solves_reacher_far_more_often_than_doing_noth
     for seed in range(4):
         spec = EpisodeSpec("reacher", "ind_test", seed, options={"size": (16, 16)})
         wins["planned"] += play(
-            stage, spec, Planned(search, rollouts, StateDistance(frames=None))
+            stage, spec, PlanningController(search, rollouts, StateDistance(frames=None))
         ).success
-        wins["still"] += play(stage, spec, Still()).success
+        wins["still"] += play(stage, spec, StillController()).success
     assert wins["planned"] >= 3
     assert wins["still"] == 0
 
@@ -93,7 +101,7 @@ def test_a_planner_is_told_what_no_motion_is(kind, monkeypatch):
     card = replace(tiny.Slide.card, action=replace(tiny.Slide.card.action, kind=kind))
     monkeypatch.setattr(tiny.Slide, "card", card)
     rollouts = SimulatorRollouts(tiny.Slide(), stride=2)
-    controller = Planned(Told(**SMALL), rollouts, StateDistance(), usual=[0.5, 1.0])
+    controller = PlanningController(Told(**SMALL), rollouts, StateDistance(), usual=[0.5, 1.0])
     taken = np.stack(played(controller, 0).history.actions)
     assert len(asked) == len(controller.decisions) > 2
     high = np.array(card.action.high)
@@ -156,18 +164,18 @@ def test_seen_through_the_codec_states_are_those_of_the_reconstruction():
 
 
 def test_scripts_and_chance_act_as_they_say():
-    solved = played(Scripted(solves=True), 0)
+    solved = played(ScriptedController(solves=True), 0)
     assert solved.success
     with pytest.raises(NoSolutionError, match="'shy' has no scripted solution"):
-        played(Scripted(solves=True), 0, tiny.SHY)
-    policy = played(Scripted(solves=False), 0)
+        played(ScriptedController(solves=True), 0, tiny.SHY)
+    policy = played(ScriptedController(solves=False), 0)
     steps = np.stack(policy.history.actions)
     recorded = simulate(tiny.Slide(), tiny.spec(0)).actions
     assert np.array_equal(steps, recorded[: len(steps)])  # the data's own behaviour
-    chance = np.stack(played(RandomActions(3), 1).history.actions)
+    chance = np.stack(played(RandomController(3), 1).history.actions)
     assert np.array_equal(chance[:3], chance[[0, 0, 0]])
     assert not np.array_equal(chance[0], chance[3])
-    assert np.array_equal(chance, np.stack(played(RandomActions(3), 1).history.actions))
+    assert np.array_equal(chance, np.stack(played(RandomController(3), 1).history.actions))
 
 
 def test_goals_ahead_are_made_by_the_behaviour():
@@ -184,6 +192,8 @@ def test_goals_ahead_are_made_by_the_behaviour():
     found = play(stage, tiny.spec(0), planner())
     assert found.success
     late = play(
-        tiny.environment(TaskVariant(tiny.PLACE, steps=None, max_steps=3)), tiny.spec(0), Still()
+        tiny.environment(TaskVariant(tiny.PLACE, steps=None, max_steps=3)),
+        tiny.spec(0),
+        StillController(),
     )
     assert len(late.history.actions) == 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from acwm_core.plugins import catalog
-from acwm_play.wheel import PERSON, POLICY, Wheel
+from acwm_play.action_source import PERSON, POLICY, ActionSource
 from acwm_play.worlds import tasks_of
 from tests.play import drivers
 from tests.play.test_server import dark, played
@@ -34,20 +34,20 @@ def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(run, tmp_path):
         picture = np.frombuffer(base64.b64decode(told["pixels"]), np.uint8)
         np.testing.assert_array_equal(picture.reshape(*told["size"], 3), goal.frame)
         found, head = [], {"n": 0}
-        while not (head.get("standing") and head["standing"]["solved"]):
+        while not (head.get("progress") and head["progress"]["solved"]):
             head, *_ = await page.next()
             if head["n"] == 4:
-                found.append(head["standing"]["distance"])
+                found.append(head["progress"]["distance"])
         assert found[:-1] == distances[4 : 4 * len(found) : 4]
         last = await page.told("attempt", lambda said: said["phase"] == "solved")
         assert last["decisions"] == -(-len(actions) // 5)
         assert last["took"] >= 0
         await page.silence()  # it holds still until the page asks
         await page.say("drive", by="you")
-        assert (await page.next())[0]["standing"]["solved"]  # the goal stays
+        assert (await page.next())[0]["progress"]["solved"]  # the goal stays
         await page.say("open", index=4)
         head, *_ = await page.until(lambda found: found[0]["n"] == 4)
-        assert head["standing"] is None
+        assert head["progress"] is None
 
     played(run, tmp_path, story)
 
@@ -129,7 +129,7 @@ def test_the_planner_plans_with_the_model_that_is_played(run, tmp_path):
         said = await page.told("attempt", lambda said: said["phase"] == "acting")
         assert said["took"] > 0
         head, *_ = await page.until(lambda found: found[0]["places"] not in (None, *places))
-        assert head["standing"]["distance"] > 0
+        assert head["progress"]["distance"] > 0
 
     played(run, tmp_path, story)
 
@@ -137,14 +137,15 @@ def test_the_planner_plans_with_the_model_that_is_played(run, tmp_path):
 def test_nobody_unknown_drives_and_none_in_a_world_without_tasks():
     assert tasks_of("cloth_move_8d") == {}
     told = []
-    wheel, stage = Wheel(lambda kind, **values: told.append(kind)), SimpleNamespace(tasks={})
-    wheel.hand_to("nobody")
-    assert wheel.driver == PERSON
-    wheel.hand_to(POLICY)
-    wheel.begin(stage)
-    assert wheel.driver == POLICY
-    wheel.hand_to("stuck", "place")
-    wheel.begin(stage)
-    assert wheel.driver == PERSON
-    assert asyncio.run(wheel.ready(stage, asyncio.Event()))
+    source = ActionSource(lambda kind, **values: told.append(kind))
+    live = SimpleNamespace(tasks={})
+    source.hand_to("nobody")
+    assert source.driver == PERSON
+    source.hand_to(POLICY)
+    source.begin(live)
+    assert source.driver == POLICY
+    source.hand_to("stuck", "place")
+    source.begin(live)
+    assert source.driver == PERSON
+    assert asyncio.run(source.ready(live, asyncio.Event()))
     assert told == []

@@ -262,10 +262,10 @@ def test_the_episodes_are_the_simulators(written):
     about = unpacked(folder, "about")
     simulator = Simulator("push_cube", SIZE)
     for episode in json.loads(about)["episodes"]:
-        moments = simulator.start(Scene(episode["index"]))
-        moments += [simulator.step(np.array(row)) for row in episode["actions"]]
+        time_steps = simulator.start(Scene(episode["index"]))
+        time_steps += [simulator.step(np.array(row)) for row in episode["actions"]]
         frames = np.frombuffer(unpacked(folder, f"episode{episode['index']}"), np.uint8)
-        truth = np.stack([moment.frame for moment in moments])
+        truth = np.stack([time_step.frame for time_step in time_steps])
         np.testing.assert_array_equal(frames.reshape(truth.shape), truth)
     simulator.close()
 

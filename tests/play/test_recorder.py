@@ -9,22 +9,22 @@ from acwm_core.data.card import CARD
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_formats.check import check_dataset
 from acwm_play.recorder import Recording, save
-from acwm_play.simulator import Moment
+from acwm_play.simulator import TimeStep
 from tests.evaluation import tiny
 
 CARD_OF_WORLD = tiny.Drift.card
 
 
-def moment(place):
+def time_step(place):
     frame = np.full((32, 32, 3), place, np.uint8)
     factors = {"colour": 200, "ground": 30}
     state = {"position": np.full(2, place, np.float64)}
     action = np.full(2, place and 1, np.float32)
-    return Moment(frame, frame[..., 0] * 0, state, ((0, 1),), factors, None, action)
+    return TimeStep(frame, frame[..., 0] * 0, state, ((0, 1),), factors, None, action)
 
 
 def recording(frames):
-    return Recording([moment(n) for n in range(frames)], [moment(0).frame] * frames)
+    return Recording([time_step(n) for n in range(frames)], [time_step(0).frame] * frames)
 
 
 @pytest.fixture(autouse=True, scope="module")

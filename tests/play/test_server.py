@@ -13,7 +13,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from acwm_core.data.episodes import EpisodeDataset
 from acwm_formats.check import check_dataset
 from acwm_play import serve
-from acwm_play.house import House
+from acwm_play.pool import WorldPool
 from acwm_play.worlds import playable
 
 TOKEN = "t" * 43
@@ -75,15 +75,15 @@ def played(run, out, story):
     """Run `story(page, client)` against a server of its own."""
 
     async def go():
-        house = House(playable([run]))
-        server = TestServer(serve.Server(house, out, TOKEN).application())
+        pool = WorldPool(playable([run]))
+        server = TestServer(serve.Server(pool, out, TOKEN).application())
         try:
             async with TestClient(server) as client:
                 origin = f"http://{client.host}:{client.port}"
                 async with client.ws_connect(f"/{TOKEN}/socket", origin=origin) as socket:
                     await story(Page(socket), client)
         finally:
-            await house.close()
+            await pool.close()
 
     asyncio.run(go())
 

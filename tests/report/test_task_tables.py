@@ -8,7 +8,7 @@ import pytest
 from acwm_core.cli import main
 from acwm_core.errors import DataError
 from acwm_experiment.table import Experiment, ExperimentCell
-from acwm_planning.planned import PlannedTask
+from acwm_planning.jobs import PlanningJob
 from acwm_report.page import export_report, write_report
 from acwm_report.run import evaluated_runs
 from tests.report.test_plans import add_plans, make_run
@@ -18,7 +18,7 @@ WEIGHTS = hashlib.sha256(b"weights").hexdigest()
 
 def task(run, row, table="All worlds", rows=("model", "still"), seeds=tuple(range(8))):
     folder = run / "planning" / "place"
-    return PlannedTask(table, row, run, "drift", "place", {"planner": {}}, rows, seeds, folder)
+    return PlanningJob(table, row, run, "drift", "place", {"planner": {}}, rows, seeds, folder)
 
 
 def experiment(*plans, cells=()):
@@ -62,7 +62,7 @@ def test_all_worlds_stand_in_one_table(two, tmp_path):
 
 def test_rows_that_nobody_asked_for_and_other_settings_are_not_shown(two, tmp_path):
     fewer = task(two[0], "One", rows=("model",))
-    other = PlannedTask(**{**vars(task(two[1], "Two")), "settings": {"planner": {"name": "cem"}}})
+    other = PlanningJob(**{**vars(task(two[1], "Two")), "settings": {"planner": {"name": "cem"}}})
     page = write_report([], tmp_path / "page.html", experiment=experiment(fewer, other)).read_text()
     assert "Nothing" not in page
     assert "Not played yet: Two." in page

@@ -82,7 +82,7 @@ def judged(seen: Observation, task: Task, start: Start) -> Outcome:
 
 
 @dataclass(frozen=True)
-class Played:
+class PolicyEpisode:
     """An episode that was played in the true simulator.
 
     Attributes:

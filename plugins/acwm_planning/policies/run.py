@@ -23,7 +23,7 @@ from acwm_core.executors import progress_bar
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
-from acwm_planning.policies.episode import Outcome, Played, Start, judged
+from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, judged
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.ranking import FILE, Ranking
 from acwm_planning.policies.scripted import ScriptedPolicy, declared, scripted, solvable
@@ -93,16 +93,16 @@ class Ranker:
         card = self._stage.environment.card
         return EpisodeSpec(card.name, SPLIT, seed, options={"size": card.frame_size})
 
-    def _played(self, start: Start, policy: ScriptedPolicy) -> Played:
+    def _played(self, start: Start, policy: ScriptedPolicy) -> PolicyEpisode:
         task, goal = self._stage.task, start.goal
         return self._simulator.play(start, lambda env: policy.begin(env, task, goal), self._steps)
 
-    def _read(self, start: Start, true: Played) -> Outcome:
+    def _read(self, start: Start, true: PolicyEpisode) -> Outcome:
         seen = self._estimator.read(as_video(np.stack(true.frames)))
         return judged(seen, self._stage.task, start)
 
     def _line(
-        self, name: str, seed: int, loop: str, start: Start, true: Played, seen: Outcome
+        self, name: str, seed: int, loop: str, start: Start, true: PolicyEpisode, seen: Outcome
     ) -> Line:
         facts = {"policy": name, "seed": seed, "loop": loop, "truth": true.outcome.facts()}
         return {**facts, "estimator": self._read(start, true).facts(), "model": seen.facts()}

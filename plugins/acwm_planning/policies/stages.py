@@ -16,7 +16,7 @@ from acwm_core.env.task import Frame, Goal, Task, TaskEnvironment
 from acwm_core.errors import noting
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
-from acwm_planning.policies.episode import Outcome, Played, Start, joined, judged, outcome
+from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, joined, judged, outcome
 from acwm_planning.policies.own import OwnPolicy
 
 
@@ -68,7 +68,9 @@ class SimulatorStage(Stage):
         goal = self.environment.goal
         return Start(spec, np.stack(frames), between, goal, float(info["distance"]))
 
-    def play(self, start: Start, begin: Callable[[Environment], Policy], steps: int) -> Played:
+    def play(
+        self, start: Start, begin: Callable[[Environment], Policy], steps: int
+    ) -> PolicyEpisode:
         """Play one episode with a policy that looks at the simulator."""
         self.start(start.spec, start.goal)
         with noting(f"in episode {start.spec.index} of {start.spec.split}", *self._parts):
@@ -85,7 +87,7 @@ class SimulatorStage(Stage):
         """See `Stage.perform`."""
         return self.performed(start, policy, steps).outcome
 
-    def performed(self, start: Start, policy: OwnPolicy, steps: int) -> Played:
+    def performed(self, start: Start, policy: OwnPolicy, steps: int) -> PolicyEpisode:
         """The same as `perform`, with all frames and actions."""
         self.start(start.spec, start.goal)
         self._frame = start.frames[-1]
@@ -99,7 +101,7 @@ class SimulatorStage(Stage):
 
         return self._go_on(start, act, steps)
 
-    def _go_on(self, start: Start, act: Policy, steps: int) -> Played:
+    def _go_on(self, start: Start, act: Policy, steps: int) -> PolicyEpisode:
         frames: list[Frame] = []
         actions, distances, success = list[NDArray[np.float32]](), list[float](), list[bool]()
         for _ in range(steps):
@@ -109,7 +111,7 @@ class SimulatorStage(Stage):
             distances.append(info["distance"])
             success.append(info["success"])
         made = outcome(np.array(distances, np.float64), np.array(success), start)
-        return Played(frames, np.stack(actions), made)
+        return PolicyEpisode(frames, np.stack(actions), made)
 
 
 class ModelStage(Stage):

@@ -52,15 +52,15 @@ def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorde
         stride: video frames per latent frame; the episode ends with a whole latent frame.
     """
     latent_frames = round(SECONDS * simulator.card.fps / stride)
-    moments = simulator.start(Scene(index), given)
+    time_steps = simulator.start(Scene(index), given)
     stills = [simulator.still()] * given
     for _ in range(stride * latent_frames):
-        moments.append(simulator.step_by_policy(anew=False))
+        time_steps.append(simulator.step_by_policy(anew=False))
         stills.append(simulator.still())
     return Recorded(
         index,
-        np.stack([moment.frame for moment in moments]),
-        np.stack([moment.action for moment in moments[1:]]),
+        np.stack([time_step.frame for time_step in time_steps]),
+        np.stack([time_step.action for time_step in time_steps[1:]]),
         np.stack(stills).astype(np.float32),
     )
 

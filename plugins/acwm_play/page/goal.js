@@ -41,12 +41,12 @@ function goal(message) {
   const { summary } = world.tasks.find(({ name }) => name === message.task);
   $("aim").textContent = summary[0].toUpperCase() + summary.slice(1);
   $("task").value = message.task;
-  standing(message, 0);
+  showProgress(message, 0);
   showAttempt();
 }
 
 // How the simulator's frame stands to the goal; `passed` seconds after the one before.
-function standing(now, passed) {
+function showProgress(now, passed) {
   if (!aim || !now) return;
   const { unit, tolerance } = world.tasks.find(({ name }) => name === aim.task);
   aim.solved = now.solved;

@@ -186,7 +186,7 @@ function headline(head) {
   note("pixel_error", head.alone, error);
   tile("pixel_error", "Pixel error", error === null ? "–" : `${error.toFixed(1)} %`, "root mean square");
   spread(head.alone, head.spread);
-  standing(head.standing, head.n / world.fps);
+  showProgress(head.progress, head.n / world.fps);
   if (state.recording && head.recorded) {
     $("record").querySelector("span").textContent = `Stop · ${((head.recorded - 1) / world.fps).toFixed(0)} s`;
   }

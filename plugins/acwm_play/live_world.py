@@ -17,7 +17,7 @@ from acwm_play.dream import Dream
 from acwm_play.figures import Instruments
 from acwm_play.layout import controls, physics_of
 from acwm_play.process import SimulatorProcess
-from acwm_play.simulator import Moment, Scene
+from acwm_play.simulator import Scene, TimeStep
 from acwm_play.workers import Workers
 from acwm_play.worlds import World, tasks_of
 
@@ -26,7 +26,7 @@ MEMORY = 64
 
 
 @dataclasses.dataclass
-class Stage:
+class LiveWorld:
     """The parts of a world that is played.
 
     Attributes:
@@ -38,7 +38,7 @@ class Stage:
         controls: description of the action's dimensions for the page.
         tasks: the world's tasks by name; empty if nobody drives towards goals.
         scene: the scene that was started last.
-        recent: the simulator's last moments in this scene, at most `MEMORY` or as many as the
+        recent: the simulator's last time steps in this scene, at most `MEMORY` or as many as the
             model starts from.
     """
 
@@ -50,10 +50,10 @@ class Stage:
     controls: list[dict[str, Any]]
     tasks: dict[str, Task]
     scene: Scene
-    recent: deque[Moment]
+    recent: deque[TimeStep]
 
     @classmethod
-    async def built(cls, world: World, workers: Workers) -> Stage:
+    async def built(cls, world: World, workers: Workers) -> LiveWorld:
         """Load everything that a world needs.
 
         Raises:
@@ -72,31 +72,31 @@ class Stage:
         parts = world, workers, simulator, dream, instruments, described, tasks
         return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, dream.given)))
 
-    async def begin(self, scene: Scene) -> tuple[Moment, NDArray[np.uint8]]:
-        """Start a scene; returns the simulator's moment and the model's picture of it.
+    async def begin(self, scene: Scene) -> tuple[TimeStep, NDArray[np.uint8]]:
+        """Start a scene; returns the simulator's time step and the model's picture of it.
 
         Raises:
             AcwmError: a factor does not have this value, or the simulator failed.
         """
-        moments = await self.simulator.start(scene, self.dream.given)
+        time_steps = await self.simulator.start(scene, self.dream.given)
         self.recent.clear()
-        self.recent.extend(moments)
+        self.recent.extend(time_steps)
         self.scene = scene
-        return moments[-1], await self.take_over()
+        return time_steps[-1], await self.take_over()
 
     async def take_over(self) -> NDArray[np.uint8]:
         """Restart the model from the simulator's last frames; returns its picture of the last."""
         given = [*self.recent][-self.dream.given :]
-        frames = np.stack([moment.frame for moment in given])
-        actions = [moment.action for moment in given][1:]
+        frames = np.stack([time_step.frame for time_step in given])
+        actions = [time_step.action for time_step in given][1:]
         return await self.workers.run("model", self.dream.restart, frames, actions)
 
-    async def act(self, action: NDArray[np.float32]) -> Moment:
+    async def act(self, action: NDArray[np.float32]) -> TimeStep:
         """Advance the simulator by one frame."""
         self.recent.append(await self.simulator.step(action))
         return self.recent[-1]
 
-    async def act_by_policy(self, anew: bool) -> Moment:
+    async def act_by_policy(self, anew: bool) -> TimeStep:
         """Advance the simulator by one frame with its behaviour policy."""
         self.recent.append(await self.simulator.step_by_policy(anew))
         return self.recent[-1]
@@ -118,9 +118,9 @@ class Stage:
         """End the simulator."""
         await self.simulator.close()
 
-    def about(self, moment: Moment) -> dict[str, Any]:
+    def about(self, time_step: TimeStep) -> dict[str, Any]:
         """Describe the world and its scene for the page."""
-        card, label = self.simulator.card, moment.ood_label
+        card, label = self.simulator.card, time_step.ood_label
         shared = about_world(
             self.world.name, card, self.dream.stride, self.controls, self.simulator.pointing
         )
@@ -133,7 +133,7 @@ class Stage:
             "factors": [dataclasses.asdict(factor) for factor in card.factors],
             "index": self.scene.index,
             "asked": dict(self.scene.factors),
-            "drawn": dict(moment.factors),
+            "drawn": dict(time_step.factors),
             "ood": label.split("+") if label else [],
         }
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, PluginError, check_shape, noting
 from acwm_planning.planner import Driver
-from acwm_play.simulator import Moment
-from acwm_play.stage import Stage
+from acwm_play.live_world import LiveWorld
+from acwm_play.simulator import TimeStep
 
 Phase = Literal["starting", "planning", "acting", "solved"]
 """What an attempt is doing: `starting` draws the goal and loads the driver."""
@@ -30,21 +30,21 @@ class StoppedError(AcwmError):
     """Nobody waits for a decision any more."""
 
 
-class Attempt:
+class GoalEpisode:
     """Decides in a thread, while the simulator holds still, and goes on until the goal is reached.
 
     Args:
-        stage: where it acts.
+        live: where it acts.
         driver: registered name of the driver.
-        task: name of one of the stage's tasks.
+        task: name of one of its tasks.
         tell: sends a message to the page, see `acwm_play.messages.Text`.
 
     Attributes:
         solved: whether the goal has been reached.
     """
 
-    def __init__(self, stage: Stage, driver: str, task: str, tell: Callable[..., None]) -> None:
-        self._stage, self._name, self._task, self._tell = stage, driver, task, tell
+    def __init__(self, live: LiveWorld, driver: str, task: str, tell: Callable[..., None]) -> None:
+        self._live, self._name, self._task, self._tell = live, driver, task, tell
         self._driver: Driver | None = None
         self._plan: deque[Action] = deque()
         self._thinking: asyncio.Task[None] | None = None
@@ -73,14 +73,14 @@ class Attempt:
             thinking.result()
         return False
 
-    async def act(self) -> Moment:
+    async def act(self) -> TimeStep:
         """Take the next action; hold still for the rest of a latent frame in which it is solved."""
         still = self.solved or not self._plan
-        action = await self._stage.simulator.still() if still else self._plan.popleft()
-        moment = await self._stage.act(action)
-        if moment.standing is not None and moment.standing.solved and not self.solved:
+        action = await self._live.simulator.still() if still else self._plan.popleft()
+        time_step = await self._live.act(action)
+        if time_step.progress is not None and time_step.progress.solved and not self.solved:
             self._finish()
-        return moment
+        return time_step
 
     def stop(self) -> None:
         """Give up: a decision in progress ends with the driver's next look at its check."""
@@ -96,18 +96,18 @@ class Attempt:
 
     async def _think(self) -> None:
         """Plan the next actions; at first, set the goal."""
-        simulator, run = self._stage.simulator, self._stage.workers.run
+        simulator, run = self._live.simulator, self._live.workers.run
         if self._driver is None:
             self._say("starting")
-            goal, standing = await simulator.aim(self._task)
-            self._tell("goal", **_shown(goal), task=self._task, **dataclasses.asdict(standing))
-            if standing.solved:
+            goal, progress = await simulator.aim(self._task)
+            self._tell("goal", **_shown(goal), task=self._task, **dataclasses.asdict(progress))
+            if progress.solved:
                 self._finish()
                 return
             still = await simulator.still()
             self._driver = await run("driver", self._begun, goal, still)
         self._say("planning")
-        recent = [*self._stage.recent]
+        recent = [*self._live.recent]
         frames, actions = [each.frame for each in recent], [each.action for each in recent[1:]]
         decided, self._took = await run("driver", self._decided, self._driver, frames, actions)
         self._plan.extend(decided)
@@ -115,12 +115,12 @@ class Attempt:
         self._say("acting")
 
     def _begun(self, goal: Goal, still: Action) -> Driver:
-        stage = self._stage
+        live = self._live
         self._check()
-        task, card = stage.tasks[self._task], stage.simulator.card
-        driver = stage.workers.driver(self._name, stage.world, card, task)
+        task, card = live.tasks[self._task], live.simulator.card
+        driver = live.workers.driver(self._name, live.world, card, task)
         with noting(f"when the driver {self._name!r} begins", driver):
-            driver.begin(goal, still, stage.scene.index)
+            driver.begin(goal, still, live.scene.index)
         return driver
 
     def _decided(
@@ -131,7 +131,7 @@ class Attempt:
         began = time.monotonic()
         with noting(f"while {self._name!r} drives", driver):
             made = np.asarray(driver.act(frames, actions, self._check), np.float32)
-            check_shape(driver, "act", made, -1, self._stage.simulator.card.action.size)
+            check_shape(driver, "act", made, -1, self._live.simulator.card.action.size)
             if not len(made):
                 raise PluginError(f"{type(driver).__name__}.act gives no action")
         return made, time.monotonic() - began

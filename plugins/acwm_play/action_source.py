@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from acwm_core.plugins import catalog
 from acwm_play import messages
-from acwm_play.attempt import Attempt
-from acwm_play.simulator import Moment
-from acwm_play.stage import Stage
+from acwm_play.goal_episode import GoalEpisode
+from acwm_play.live_world import LiveWorld
+from acwm_play.simulator import TimeStep
 
 PERSON, POLICY = "you", "policy"
 """Who can act in every world; registered drivers act in worlds with tasks."""
 
 
-class Wheel:
+class ActionSource:
     """Gives the next action of whoever drives.
 
     Args:
@@ -33,7 +33,7 @@ class Wheel:
         self.driver, self.seq = PERSON, 0
         self._tell = tell
         self._task: str | None = None
-        self._attempt: Attempt | None = None
+        self._attempt: GoalEpisode | None = None
         self._values: list[float] | None = None
         self._places: NDArray[np.float64] | None = None
         self._anew = True
@@ -57,10 +57,10 @@ class Wheel:
             self.stop()
             self.driver, self._task = by, task or self._task
 
-    def begin(self, stage: Stage) -> None:
+    def begin(self, live: LiveWorld) -> None:
         """A scene has begun; whoever drives begins anew."""
         self.stop()
-        self._choose(stage)
+        self._choose(live)
 
     def stop(self) -> None:
         """Forget what was wanted and planned."""
@@ -70,41 +70,41 @@ class Wheel:
             self._attempt = None
             self._tell("attempt", phase=None)
 
-    async def ready(self, stage: Stage, wake: asyncio.Event) -> bool:
+    async def ready(self, live: LiveWorld, wake: asyncio.Event) -> bool:
         """Whether the next action is known; if not, wait until it is, or until `wake` is set.
 
         Raises:
             Exception: a driver failed; the person drives again.
         """
-        self._choose(stage)
+        self._choose(live)
         if self._task is None or self.driver in (PERSON, POLICY):
             return True
         if self._attempt is None:
-            self._attempt = Attempt(stage, self.driver, self._task, self._tell)
+            self._attempt = GoalEpisode(live, self.driver, self._task, self._tell)
         try:
             return await self._attempt.ready(wake)
         except Exception:
             self.hand_to(PERSON)
             raise
 
-    async def act(self, stage: Stage) -> Moment:
+    async def act(self, live: LiveWorld) -> TimeStep:
         """Advance the simulator by one frame, after `ready`."""
         if self._attempt is not None:
             return await self._attempt.act()
         if self.driver == POLICY:
             anew, self._anew = self._anew, False
-            return await stage.act_by_policy(anew)
-        pointing = stage.simulator.pointing
+            return await live.act_by_policy(anew)
+        pointing = live.simulator.pointing
         if self._places is not None and pointing is not None:
-            return await stage.act(pointing.action(self._places))
-        if self._values is not None and len(self._values) == len(stage.controls):
-            return await stage.act(np.array(self._values, np.float32))
-        return await stage.act(await stage.simulator.still())
+            return await live.act(pointing.action(self._places))
+        if self._values is not None and len(self._values) == len(live.controls):
+            return await live.act(np.array(self._values, np.float32))
+        return await live.act(await live.simulator.still())
 
-    def _choose(self, stage: Stage) -> None:
+    def _choose(self, live: LiveWorld) -> None:
         """Choose a task of this world for a driver; the person drives if it has none."""
-        if self._task not in stage.tasks:
-            self._task = next(iter(stage.tasks), None)
+        if self._task not in live.tasks:
+            self._task = next(iter(live.tasks), None)
         if self._task is None and self.driver != POLICY:
             self.driver = PERSON
 

@@ -19,7 +19,7 @@ SUMMARY = "summary.json"
 
 
 @dataclass(frozen=True)
-class PlannedTask:
+class PlanningJob:
     """Episodes that `acwm plan` plays, finished or not."""
 
     table: str  # title of the table that it is part of
