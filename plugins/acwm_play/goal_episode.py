@@ -119,7 +119,7 @@ class GoalEpisode:
         self._check()
         task, card = live.tasks[self._task], live.simulator.card
         driver = live.workers.driver(self._name, live.world, card, task)
-        with noting(f"when the driver {self._name!r} begins", driver):
+        with noting(f"when driver {self._name!r} begins", driver):
             driver.begin(goal, still, live.scene.index)
         return driver
 
@@ -129,7 +129,7 @@ class GoalEpisode:
         """The next actions `[n, A]`, and how many seconds the decision took."""
         self._check()
         began = time.monotonic()
-        with noting(f"while {self._name!r} drives", driver):
+        with noting(f"while driver {self._name!r} acts", driver):
             made = np.asarray(driver.act(frames, actions, self._check), np.float32)
             check_shape(driver, "act", made, -1, self._live.simulator.card.action.size)
             if not len(made):
