@@ -27,7 +27,8 @@ from acwm_core.plugins import catalog
 
 if TYPE_CHECKING:
     from acwm_core.data.card import DatasetCard
-    from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+    from acwm_core.data.clips import ClipDataset
+    from acwm_core.data.dataset import EpisodeDataset
     from acwm_core.data.generate import generate
     from acwm_core.env.environment import Environment
     from acwm_core.env.task import Task, TaskEnvironment
@@ -62,8 +63,8 @@ __all__ = [
 
 _HOMES = {
     "AcwmError": "acwm_core.errors:AcwmError",
-    "ClipDataset": "acwm_core.data.episodes:ClipDataset",
-    "EpisodeDataset": "acwm_core.data.episodes:EpisodeDataset",
+    "ClipDataset": "acwm_core.data.clips:ClipDataset",
+    "EpisodeDataset": "acwm_core.data.dataset:EpisodeDataset",
     "Recipe": "acwm_core.recipe:Recipe",
     "WorldModel": "acwm_core.model.world_model:WorldModel",
     "build_world_model": "acwm_core.model.build:build_world_model",

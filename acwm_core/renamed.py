@@ -33,6 +33,22 @@ def with_new_names(
     return {renamed.get(name, name): value for name, value in values.items()}
 
 
+def without_removed(
+    values: Mapping[str, Any], removed: Mapping[str, str], where: str = ""
+) -> dict[str, Any]:
+    """Return `values` without those that are gone, with a `RenamedWarning` for each that is set.
+
+    Args:
+        values: values by name, from a file or a command line.
+        removed: what takes the place of a value that is gone, by its name.
+        where: prefix of the names in the warning, e.g. ``"data."``.
+    """
+    for name in values:
+        if values[name] and name in removed:
+            warnings.warn(f"{where}{name} is gone: {removed[name]}", RenamedWarning, stacklevel=2)
+    return {name: value for name, value in values.items() if name not in removed}
+
+
 RENAMED = {
     f"acwm_core.{old}": f"acwm_core.{new}"
     for old, new in {
@@ -40,6 +56,9 @@ RENAMED = {
         "catalog": "plugins",
         "codec": "model.codec",
         "conditioner": "model.conditioner",
+        "data.encoding": "data.latents",
+        "data.episodes": "data.dataset",
+        "data.manifest": "data.dataset",
         "denoiser": "model.denoiser",
         "dynamics": "model.dynamics",
         "environment": "env.environment",

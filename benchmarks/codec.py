@@ -20,7 +20,7 @@ from codec_pictures import picture
 from PIL import Image
 from torch import Tensor
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.env.episode import Split
 from acwm_core.model.codec import Codec

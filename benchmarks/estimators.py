@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import AcwmError

@@ -31,7 +31,7 @@ from rich.table import Table
 
 from acwm_core.cli.arguments import size
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.evaluation import evaluate, evaluator
 from acwm_core.evaluation.evaluator import Evaluator

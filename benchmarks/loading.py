@@ -27,13 +27,13 @@ from loading_ways import Hdf5Windows, Mp4Windows, batches_of, webdataset_loader
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.data.latents import LatentClipDataset
-from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.latents import LatentClipDataset, encode_windows
+from acwm_core.data.loader import ClipLoader, ClipSampler
 from acwm_core.data.shards import open_shard
-from acwm_core.data.video import Limits, decode_into
+from acwm_core.data.video import decode_into
 from acwm_core.plugins import catalog
 
 FRAMES, STRIDE, BATCH = 37, 4, 16
@@ -91,7 +91,7 @@ def _decode_alone(folder: Path, number: int, seconds: float, together: Any, rate
     while (passed := time.perf_counter() - started) < seconds:
         episode, start = windows[order.integers(len(windows))].tolist()
         held = min(FRAMES, episodes.lengths[episode] - start)
-        decode_into(target[:held], videos[episode], start, Limits(episodes.lengths[episode]))
+        decode_into(target[:held], videos[episode], start)
         count += 1
     rates.put(count / passed)
 
@@ -124,7 +124,7 @@ def video_rows(folder: Path, scratch: Path, workers: int, seconds: float) -> lis
         rows.append(Row(way, speed, windows.path.stat().st_size, remark))
     alone = decoder_speed(folder, max(1, workers), seconds)
     rows.append(Row("decoder alone", alone, tars, f"{max(1, workers)} processes"))
-    ours = ResumableLoader(clips, batch_size=BATCH, workers=workers)
+    ours = ClipLoader(clips, ClipSampler(len(clips), batch_size=BATCH), workers=workers)
     speed = clips_per_second(ours, seconds)
     return [*rows, Row("acwm, video", speed, tars, f"{speed / alone:.0%} of the decoder")]
 
@@ -140,7 +140,7 @@ def latent_rows(folder: Path, workers: int, seconds: float) -> list[Row]:
     copies, size = copy_speed(seconds), sum(path.stat().st_size for path in kept.glob("*.npy"))
     rows: list[Row] = []
     for number in sorted({0, workers}):
-        loader = ResumableLoader(latents, batch_size=BATCH, workers=number)
+        loader = ClipLoader(latents, ClipSampler(len(latents), batch_size=BATCH), workers=number)
         speed = clips_per_second(loader, seconds)
         share = speed * clip / copies
         remark = f"{clip / 1e3:.0f} kB a clip: {share:.0%} of memcpy's {copies / 1e9:.1f} GB/s"

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from acwm_core.data.clips import padded_video, window_actions
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipDataset, padded_video, window_actions
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.video import Encoding, decode_planes, encode_frames
 
 MP4 = Encoding("rgb24", "yuv420p", "libx264", {"crf": "30", "bf": "0"}, "mp4")

@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.scoring import estimator_for

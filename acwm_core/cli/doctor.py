@@ -131,7 +131,7 @@ def _versions(component: Component) -> str:
 def _accelerator() -> str:
     import torch
 
-    from acwm_core.data.encoding import cpu_has_fast_bfloat16
+    from acwm_core.model.codec import cpu_has_fast_bfloat16
 
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}

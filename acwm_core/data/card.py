@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -21,10 +21,8 @@ from acwm_core.errors import DataError
 from acwm_core.recipe.recipe import flat_items
 from acwm_core.untrusted import MAX_YAML, PlainLoader, check_folder, read_bytes, typed
 
-CARD = "card.yaml"
-
-MAX_PIXELS = 2**14
-"""Largest accepted height or width of a frame; a larger one must be an error."""
+CARD, MANIFEST = "card.yaml", "manifest.jsonl"
+"""The files of a data folder, and of each split in it."""
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
 """Exceptions that reading a card raises if the file is not a card."""
@@ -111,17 +109,10 @@ class DatasetCard:
         typed(values, cls)  # checks only; its result is not used, so that an int stays an int
         others = {name: value for name, value in values.items() if name != "environment"}
         card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
-        # Refuse what could mislead a reader: folders that are no splits, absurd sizes.
-        counts: list[Any] = [*card.splits.values(), card.shard_episodes]
-        counts += [card.environment.fps, card.environment.horizon]
-        known = set(card.splits) <= set(SPLITS)
-        if not known or not all(isinstance(count, int) and count > 0 for count in counts):
-            raise ValueError(f"splits {dict(card.splits)}, or another count, are impossible")
-        sides: tuple[Any, ...] = card.environment.frame_size
-        if len(sides) != 2 or not all(isinstance(n, int) and 0 < n <= MAX_PIXELS for n in sides):
-            raise ValueError(f"frames of {sides} are impossible")
+        if not set(card.splits) <= set(SPLITS):  # they are names of folders
+            raise ValueError(f"{dict(card.splits)} are no splits")
         for split, statistics in card.actions.items():
-            if not are_numbers(statistics.values()):
+            if not all(math.isfinite(n) for row in statistics.values() for n in row):
                 raise ValueError(f"the actions' statistics of {split} are not finite numbers")
         return card
 
@@ -180,15 +171,6 @@ class DatasetCard:
             if before != after and not (name.startswith("splits.") and only_one):
                 found.append(f"{name} is {before} there, {after} now")
         return found
-
-
-def are_numbers(rows: Iterable[Sequence[Any]]) -> bool:
-    """Whether all rows have the same length and hold only finite numbers."""
-    rows = [*rows]
-    numbers = (
-        isinstance(each, int | float) and math.isfinite(each) for row in rows for each in row
-    )
-    return all(numbers) and len({len(row) for row in rows}) == 1
 
 
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:

@@ -1,19 +1,24 @@
-"""Which clips training takes and in what order: the recipe's section `data`, windows, the sampler.
+"""Which clips training takes: the recipe's section `data`, the windows of episodes, `ClipDataset`.
 
 It does not import torch, so that recipes are checked quickly.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, RecipeError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from acwm_core.data.dataset import EpisodeDataset
 
 
 @dataclass(frozen=True)
@@ -43,8 +48,6 @@ class DataConfig:
             exactly; `webdataset` streams the shards, so a dataset may be larger than the disk.
         shuffle_buffer: size of the buffer, in clips, from which each process of the `webdataset`
             reader draws the next clip.
-        skip_damaged: if a shard is damaged, warn, replace its clips by other clips (always the
-            same ones) and go on. By default training stops and names the shard.
     """
 
     path: str
@@ -59,7 +62,6 @@ class DataConfig:
     workers: int = 0
     reader: Literal["random_access", "webdataset"] = "random_access"
     shuffle_buffer: int = 2000
-    skip_damaged: bool = False
 
     def __post_init__(self) -> None:
         minima = {"batch_size": 1, "clip_frames": 2, "window_stride": 1, "workers": 0}
@@ -196,88 +198,78 @@ def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDA
     return window
 
 
-def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[np.int64]:
-    """The order of clips in epoch `epoch` of a stream: a permutation of ``0 … length − 1``."""
-    key = np.random.SeedSequence([seed, epoch, stream] if stream else [seed, epoch])
-    return np.random.Generator(np.random.Philox(key)).permutation(length)
-
-
-class ClipSampler:
-    """A batch sampler over an endless stream of epochs, each a permutation of all clips.
-
-    A step of W ranks takes the next W·B clips, a batch of B per rank. A batch cannot hold clips of
-    different lengths, so each length has its own stream. The streams take turns, evenly spread and
-    in proportion to their clips; all clips of a step come from one stream.
+class Clips(ABC):
+    """The windows of a split's episodes as a map-style dataset of clips.
 
     Args:
-        length: number of clips.
-        batch_size: clips per batch of one rank.
-        seed: seed of the order; the same on every rank.
-        rank: index of this process, 0 … world_size − 1.
-        world_size: number of processes that train together.
-        lengths: length of each clip; the longest form stream 0. All equal by default.
-        accumulated: batches per rank and optimiser step, all of one length.
+        episodes: where the clips come from.
+        frames: frames of a clip, T; a shorter episode gives one clip.
+        stride: frames between the starts of an episode's clips.
+        indices: only these episodes, e.g. those of `hold_out`; all by default.
+        temporal_stride: temporal stride of the codec. Clips of shorter episodes are then cut to
+            whole latent frames; by default they repeat their last frame with zero actions.
+        given: context frames of a clip; every clip has at least one latent frame more to predict.
+        per_length: how many clips should share a length, as those of a batch do; see
+            `shared_lengths`.
 
     Attributes:
-        position: number of clips that all ranks together have taken; an iteration starts there.
-            An iteration does not change it: the consumer sets it, as only the consumer knows
-            which prefetched clips were used.
+        windows: rows ``(episode, first frame)``, one per clip.
+        lengths: number of video frames of each clip; see `clip_lengths` and `shared_lengths`.
     """
 
     def __init__(
         self,
-        length: int,
+        episodes: EpisodeDataset,
         *,
-        batch_size: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        lengths: Sequence[int] | NDArray[np.int64] | None = None,
-        accumulated: int = 1,
+        frames: int = 37,
+        stride: int = 4,
+        indices: Sequence[int] | None = None,
+        temporal_stride: int | None = None,
+        given: int = 1,
+        per_length: int = 1,
     ) -> None:
-        if length < 1:
-            raise ValueError("there are no clips to sample from")
-        self.batch_size, self.seed = batch_size, seed
-        self.rank, self.world_size = rank, world_size
-        self.position = 0
-        self._step = accumulated * self.clips_per_step
-        of_clips = np.zeros(length) if lengths is None else np.asarray(lengths)
-        self._streams = [np.flatnonzero(of_clips == one) for one in np.unique(of_clips)[::-1]]
-        self._orders: dict[int, tuple[int, NDArray[np.int64]]] = {}
-        counts = [len(members) for members in self._streams]
-        when = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
-        whose = np.repeat(np.arange(len(counts)), counts)
-        self._turns = whose[np.argsort(when, kind="stable")]  # stream of each step in one cycle
-        self._visits = np.zeros(length, np.int64)  # earlier turns of its stream in the cycle
-        for stream, count in enumerate(counts):
-            self._visits[self._turns == stream] = np.arange(count)
+        self.episodes, self.frames, self.stride = episodes, frames, stride
+        self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.lengths = clip_lengths(
+            self.windows, episodes.lengths, frames, temporal_stride, given, per_length
+        )
+        self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
 
-    @property
-    def clips_per_step(self) -> int:
-        """Clips that all ranks together take per step, one batch each."""
-        return self.batch_size * self.world_size
+    def __len__(self) -> int:
+        return len(self.windows)
 
-    def __iter__(self) -> Iterator[list[int]]:
-        start = self.position
-        if len(self._streams) > 1:  # round down, in case the size of a step has changed
-            start -= start % self.clips_per_step
-        first = start + self.rank * self.batch_size
-        for place in itertools.count(first, self.clips_per_step):
-            step, offset = divmod(place, self._step)
-            cycle, turn = divmod(step, len(self._turns))
-            stream = int(self._turns[turn])
-            visit = cycle * len(self._streams[stream]) + int(self._visits[turn])
-            yield self._taken(stream, visit * self._step + offset)
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """One clip: the arrays of `batch` without the batch axis."""
+        return {name: values[0] for name, values in self.batch([index]).items()}
 
-    def _taken(self, stream: int, start: int) -> list[int]:
-        """A batch of clips of one stream, from position `start` in that stream on."""
-        members, taken = self._streams[stream], list[int]()
-        epoch, offset = divmod(start, len(members))
-        while len(taken) < self.batch_size:
-            if self._orders.get(stream, (-1,))[0] != epoch:  # cached for this epoch
-                order = epoch_order(len(members), self.seed, epoch, stream)
-                self._orders[stream] = epoch, order
-            order = self._orders[stream][1]
-            taken += members[order[offset:][: self.batch_size - len(taken)]].tolist()
-            epoch, offset = epoch + 1, 0
-        return taken
+    @abstractmethod
+    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """Read clips of one length as a batch, which is faster than one by one.
+
+        Raises:
+            DataError: a shard is missing or damaged.
+        """
+
+
+class ClipDataset(Clips):
+    """Clips as video."""
+
+    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """`video` uint8 ``[B, T, 3, H, W]``, `actions` float32 ``[B, T, A]``, last rows zero."""
+        import torch
+
+        frames, card = common_length(self.lengths, indices), self.episodes.card.environment
+        video = np.empty((len(indices), frames, 3, *card.frame_size), np.uint8)
+        actions = np.empty((len(indices), frames, card.action.size), np.float32)
+        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
+        for row, (episode, start) in enumerate(windows):
+            self.episodes.video_into(video[row], episode, start)
+            actions[row] = window_actions(self._actions_of(episode), start, frames)
+        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
+
+    def _actions_of(self, episode: int) -> NDArray[np.float32]:
+        if episode not in self._actions:
+            if len(self._actions) == 2**14:  # a limit for memory; actions are small
+                self._actions.clear()
+            self._actions[episode] = self.episodes.actions(episode)
+        return self._actions[episode]

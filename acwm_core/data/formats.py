@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, cast
 
 from acwm_core.data.atomic import made_whole, writing
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.recordings import RecordedDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import Episode, Split

@@ -14,8 +14,9 @@ from typing import Any
 
 from acwm_core.data.atomic import LOCK, held, remove_partial, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions
-from acwm_core.data.manifest import Manifest, action_statistics, shard_name
+from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
+from acwm_core.data.shards import shard_name
 from acwm_core.data.simulate import (
     EpisodeSource,
     ShardTask,

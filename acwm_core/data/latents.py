@@ -3,10 +3,14 @@
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
 float16 array ``[clips, L, C, h, w]`` per shard. A card in that folder repeats these facts, so that
 a renamed or copied folder is not misread.
+
+Any number of processes encode a dataset together: each shard of latents has its own lock, because
+waiting in a collective operation would time out.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -21,12 +25,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.data.atomic import written_whole
-from acwm_core.data.clips import common_length, window_actions, window_starts
-from acwm_core.data.episodes import Clips, EpisodeDataset
-from acwm_core.data.shards import UNREADABLE
-from acwm_core.errors import DamagedShardError, DataError
-from acwm_core.model.codec import Codec
+from acwm_core.data.atomic import alone, writing, written_whole
+from acwm_core.data.clips import Clips, common_length, padded_video, window_actions, window_starts
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.errors import DataError, noting
+from acwm_core.executors import Report, progress_bar
+from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
 from acwm_core.untrusted import parse_json, read_bytes
 
 LATENTS = "latents"
@@ -58,18 +62,14 @@ class LatentFolder:
         windows = f"{episodes.split}-{self.frames}x{self.stride}-{episodes.checksum[:12]}"
         return episodes.path / LATENTS / str(self.fingerprint) / windows
 
-    def file(self, number: int, *, complete: bool = True) -> Path:
-        """The file of shard `number`; an incomplete one has NaN for damaged episodes."""
-        return self.path / f"shard-{number:05d}{'' if complete else '.incomplete'}.npy"
+    def file(self, number: int) -> Path:
+        """The file of shard `number`."""
+        return self.path / f"shard-{number:05d}.npy"
 
-    def unfinished(self, skip_damaged: bool = False) -> list[int]:
-        """Shards without latents. With `skip_damaged`, incomplete latents count as finished."""
-        return [
-            number
-            for number in range(len(self.episodes.shards))
-            if not self.file(number).exists()
-            and not (skip_damaged and self.file(number, complete=False).exists())
-        ]
+    def unfinished(self) -> list[int]:
+        """Shards without latents."""
+        numbers = range(len(self.episodes.shards))
+        return [number for number in numbers if not self.file(number).exists()]
 
     def starts(self, index: int) -> range:
         """First frames of the windows of an episode."""
@@ -103,19 +103,114 @@ class LatentFolder:
             )
 
 
+def encode_windows(
+    episodes: EpisodeDataset,
+    codec: Codec,
+    *,
+    frames: int = 37,
+    stride: int = 4,
+    batch_size: int = 8,
+    progress: bool = True,
+) -> Path:
+    """Encode every window of `episodes` that is not encoded yet.
+
+    Finished shards are kept, so an interrupted call can be resumed. Processes that call this at the
+    same time share the work, and each returns when all of it is done.
+
+    Args:
+        episodes: the split to encode.
+        codec: frozen; used in evaluation mode, on the device of its parameters.
+        stride: frames between the starts of an episode's windows; 4 gives eight windows of 37
+            frames for an episode of 66.
+
+    Returns:
+        The folder of the latents, which `LatentClipDataset` finds by the codec's fingerprint.
+
+    Raises:
+        DataError: a shard is damaged; the folder cannot be written or holds latents of another
+            codec; or the codec returned values that float16 cannot hold.
+        ShapeError: the codec cannot encode frames of this size.
+    """
+    folder = LatentFolder(episodes, codec.fingerprint(), frames, stride)
+    with writing(folder.path), contextlib.ExitStack() as stack:
+        folder.path.mkdir(parents=True, exist_ok=True)
+        folder.keep_card()
+        total = sum(episodes.shards[number][1] for number in folder.unfinished())
+        bar = progress_bar(f"encoding {episodes.split}", total, shown=progress)
+        report = stack.enter_context(bar)
+        stack.callback(codec.train, codec.training)
+        codec.eval()
+        # First the shards that no other process works on, then those that others did not finish.
+        for wait in (False, True):
+            for number in folder.unfinished():
+                with alone(folder.file(number), wait=wait) as mine:
+                    if mine and not folder.file(number).exists():
+                        _encode_shard(folder, codec, number, batch_size, report)
+    return folder.path
+
+
+def _encode_shard(
+    folder: LatentFolder, codec: Codec, number: int, batch_size: int, report: Report
+) -> None:
+    rows = list[NDArray[np.float16]]()
+    first, count = folder.episodes.shards[number]
+    for index in range(first, first + count):
+        with noting(f"in episode {index} of {folder.episodes.split}", codec):
+            rows.append(_encode_episode(folder, codec, index, batch_size))
+        report(1)
+    with written_whole(folder.file(number)) as partial, partial.open("wb") as opened:
+        np.save(opened, np.concatenate(rows))
+
+
+def _encode_episode(
+    folder: LatentFolder, codec: Codec, index: int, batch_size: int
+) -> NDArray[np.float16]:
+    """The latents of the windows of an episode, ``[windows, L, C, h, w]``."""
+    frames, group, starts = folder.frames, codec.temporal_stride, folder.starts(index)
+    device = next((p.device for p in codec.parameters()), torch.device("cpu"))
+    pixels = padded_video(folder.episodes.video(index), frames)
+    video = torch.as_tensor(pixels).to(device).float() / 255
+    fast = codec.encodes_in_bfloat16 and device.type == "cpu" and cpu_has_fast_bfloat16()
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=fast):
+        if codec.memoryless and folder.stride % group == 0 and (frames - 1) % group == 0:
+            latents = _encode_shared(codec, video, starts, frames)
+        else:
+            clips = torch.stack([video[start : start + frames] for start in starts])
+            latents = torch.cat([codec.encode(batch) for batch in torch.split(clips, batch_size)])
+    with np.errstate(over="ignore"):  # refused below
+        values = latents.float().cpu().numpy().astype(np.float16)
+    if not np.isfinite(values).all():
+        raise DataError(
+            f"{type(codec).__name__} encodes episode {index} of {folder.episodes.split} of "
+            f"{folder.episodes.path} to values that are not finite or too large for float16"
+        )
+    return values
+
+
+def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> Tensor:
+    """Encode the windows of a memoryless codec from one encoding of the whole episode.
+
+    Only the first latent frame of each window differs from the latents of the whole episode.
+    """
+    firsts = codec.encode(video[list(starts)].unsqueeze(1))
+    whole = codec.encode(video.unsqueeze(0))[0]
+    places = torch.tensor(starts) // codec.temporal_stride + 1
+    following = torch.arange(codec.latent_frames(frames) - 1)
+    return torch.cat([firsts, whole[places[:, None] + following]], 1)
+
+
 class LatentClipDataset(Clips):
-    """The latents that `acwm_core.data.encoding.encode_windows` wrote, with the clips' actions.
+    """The latents that `encode_windows` wrote, with the clips' actions.
 
     Args:
         episodes: the split they come from.
         fingerprint: of the codec, `Codec.fingerprint()`.
-        skip_damaged: accept that damaged episodes were left out; only reading one raises.
         temporal_stride: as in `Clips`.
         windows: `frames` and `stride`, as they were encoded, and `indices`, `given` and
             `per_length`, as in `Clips`.
 
     Raises:
-        DataError: these windows have not been encoded by that codec, or the latents are damaged.
+        DataError: these windows have not been encoded by that codec, or a shard is damaged.
     """
 
     def __init__(
@@ -123,14 +218,13 @@ class LatentClipDataset(Clips):
         episodes: EpisodeDataset,
         fingerprint: str,
         *,
-        skip_damaged: bool = False,
         temporal_stride: int | None = None,
         **windows: Any,
     ) -> None:
         super().__init__(episodes, temporal_stride=temporal_stride, **windows)
         frames, stride = self.frames, self.stride
-        folder = LatentFolder(episodes, fingerprint, frames, stride)
-        if folder.unfinished(skip_damaged):
+        self._folder = LatentFolder(episodes, fingerprint, frames, stride)
+        if self._folder.unfinished():
             others = sorted(path.name for path in (episodes.path / LATENTS).glob("*"))
             known = f" (there are latents of {', '.join(others)})" if others else ""
             raise DataError(
@@ -139,14 +233,9 @@ class LatentClipDataset(Clips):
                 f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
                 f"--frames {frames} --stride {stride}`"
             )
-        folder.keep_card()
+        self._folder.keep_card()
         self._temporal_stride = temporal_stride or 1
-        missing = {*folder.unfinished()}
-        self._files = [
-            folder.file(number, complete=number not in missing)
-            for number in range(len(episodes.shards))
-        ]
-        counts = [len(folder.starts(index)) for index in range(len(episodes))]
+        counts = [len(self._folder.starts(index)) for index in range(len(episodes))]
         # For every episode: its shard, and the row of its first window in the shard's array.
         self._places = [
             (number, sum(counts[first:index]))
@@ -155,24 +244,14 @@ class LatentClipDataset(Clips):
         ]
         self._rows = [sum(counts[first : first + count]) for first, count in episodes.shards]
         self._layouts: dict[int, tuple[int, tuple[int, ...]]] = {}
-        self._damaged = {
-            index: f"shard {episodes.shard_path(shard)} was damaged when it was encoded"
-            for index, (shard, row) in enumerate(self._places)
-            if shard in missing and np.isnan(self._read(shard, row, 1)).any()
-        }
         for episode in map(int, np.unique(self.windows[:, 0])):
-            try:
-                self._actions[episode] = episodes.actions(episode)
-            except DamagedShardError as error:
-                if not skip_damaged:
-                    raise
-                self._damaged.setdefault(episode, str(error))
+            self._actions[episode] = episodes.actions(episode)
 
     def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
         """`latents` float16 ``[B, L, C, h, w]``, `actions` float32 ``[B, T, A]``, last rows zero.
 
         Raises:
-            DamagedShardError: an episode of them is damaged and was left out.
+            DataError: the latents are damaged.
         """
         frames = common_length(self.lengths, indices)
         # In a window padded with repeated frames, latents before the padding do not depend on it.
@@ -180,8 +259,6 @@ class LatentClipDataset(Clips):
         latents, actions = list[NDArray[np.float16]](), list[NDArray[np.float32]]()
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
         for episode, start in windows:
-            if episode in self._damaged:
-                raise DamagedShardError(self._damaged[episode])
             shard, row = self._places[episode]
             latents.append(self._read(shard, row + start // self.stride, kept))
             actions.append(window_actions(self._actions[episode], start, frames))
@@ -196,37 +273,25 @@ class LatentClipDataset(Clips):
         They are read, not memory-mapped: accessing the map of a truncated file would kill the
         process with SIGBUS.
         """
-        offset, shape = self._layout(shard)
-        latents = np.empty((kept or shape[0], *shape[1:]), np.float16)
-        place = offset + row * math.prod(shape) * latents.itemsize
-        file = self._files[shard]
+        file = self._folder.file(shard)
         try:
+            offset, shape = self._layout(shard, file)
+            latents = np.empty((kept or shape[0], *shape[1:]), np.float16)
+            place = offset + row * math.prod(shape) * latents.itemsize
             with file.open("rb", buffering=0) as opened:
-                found = os.preadv(opened.fileno(), [latents.data], place)
-            if found != latents.nbytes:
-                raise ValueError("its end is cut off")
-        except (ValueError, OSError) as error:
-            raise _damaged(file, error) from error
+                if os.preadv(opened.fileno(), [latents.data], place) != latents.nbytes:
+                    raise ValueError("its end is cut off")
+        except (ValueError, EOFError, OSError) as error:
+            raise DataError(
+                f"the latents {file} are damaged ({error}): delete the file and encode again"
+            ) from error
         return latents
 
-    def _layout(self, shard: int) -> tuple[int, tuple[int, ...]]:
+    def _layout(self, shard: int, file: Path) -> tuple[int, tuple[int, ...]]:
         """The byte offset of a shard's latents in its file, and the shape of one window's."""
-        if shard in self._layouts:
-            return self._layouts[shard]
-        file = self._files[shard]
-        try:
+        if shard not in self._layouts:
             latents = np.load(file, mmap_mode="r", allow_pickle=False)
-            expected = self._layout(0)[1] if shard else latents.shape[1:]
-            if latents.dtype != np.float16 or latents.shape != (self._rows[shard], *expected):
+            if latents.dtype != np.float16 or len(latents) != self._rows[shard]:
                 raise ValueError(f"they are {latents.dtype} {latents.shape}")
-            if not latents.flags.c_contiguous:
-                raise ValueError("they are in another order")
-        except (OSError, *UNREADABLE) as error:
-            raise _damaged(file, error) from error
-        self._layouts[shard] = int(latents.offset), tuple(expected)
+            self._layouts[shard] = int(latents.offset), latents.shape[1:]
         return self._layouts[shard]
-
-
-def _damaged(file: Path, error: Exception) -> DataError:
-    why = f"the latents {file} are damaged ({error}): delete the file and encode again"
-    return DataError(why)

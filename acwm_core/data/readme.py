@@ -9,7 +9,7 @@ import yaml
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import Manifest
+from acwm_core.data.dataset import Manifest
 from acwm_core.untrusted import read_bytes
 
 README = "README.md"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard, package_versions
+from acwm_core.data.dataset import Manifest
 from acwm_core.data.generate import fill
-from acwm_core.data.manifest import Manifest
 from acwm_core.data.readme import write_readme
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField

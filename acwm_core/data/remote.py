@@ -13,17 +13,16 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import platformdirs
 
 from acwm_core.data.atomic import OF_THE_DISK, alone, written_whole
-from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.data.manifest import MANIFEST, MAX_BYTES, ShardRecord, file_sha256
+from acwm_core.data.card import CARD, MANIFEST, DatasetCard
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, MissingExtraError
-from acwm_core.untrusted import MAX_YAML, read_bytes
+from acwm_core.untrusted import read_bytes
 
 CACHE = "ACWM_CACHE"
 """Environment variable for the cache folder; the default is ``acwm`` in the user's cache folder."""
@@ -31,9 +30,6 @@ CACHE = "ACWM_CACHE"
 ORIGIN = ".origin"
 WAITS = (0.5, 2.0, 8.0)
 """Seconds before the second and each further attempt to fetch a file."""
-
-PATIENCE, SLOWEST = 60.0, 10_000
-"""A download may take `PATIENCE` seconds, plus one second per `SLOWEST` bytes."""
 
 PROTOCOLS = {
     "https": "aiohttp",
@@ -78,12 +74,12 @@ def data_folder(path: str | Path) -> Path:
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
     """Fetch card and manifests into `fresh`; return the folder in `cache` with the same ones."""
-    _fetch(f"{url}/{CARD}", fresh / CARD, MAX_YAML)
+    _fetch(f"{url}/{CARD}", fresh / CARD)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
         (fresh / split).mkdir()
         names.append(f"{split}/{MANIFEST}")
-        _fetch(f"{url}/{names[-1]}", fresh / names[-1], MAX_BYTES)
+        _fetch(f"{url}/{names[-1]}", fresh / names[-1])
     contents = {name: (fresh / name).read_bytes() for name in names}
     digest = hashlib.sha256(url.encode())
     for data in contents.values():
@@ -104,8 +100,8 @@ def origin(folder: Path) -> str | None:
     return read_bytes(file).decode() if file.exists() else None
 
 
-def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
-    """Fetch the shard of `record` from `url` to `path`, unless it is there.
+def fetch_shard(url: str, path: Path, sha256: str) -> None:
+    """Fetch a shard with the checksum `sha256` from `url` to `path`, unless it is there.
 
     If several processes want it, one fetches it and the others wait.
 
@@ -115,31 +111,25 @@ def fetch_shard(url: str, path: Path, record: ShardRecord) -> None:
     try:
         with alone(path):
             if not path.exists():
-                _fetch(url, path, record.size, record.sha256)
+                _fetch(url, path, sha256)
     except OSError as error:
         raise DataError(
             f"cannot write {path} ({error.strerror}): make room, or set {CACHE} to another folder"
         ) from error
 
 
-def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> None:
-    """Fetch one file of at most `max_bytes`, atomically; failures that may pass are retried."""
+def _fetch(url: str, path: Path, sha256: str | None = None) -> None:
+    """Fetch one file, atomically; failures that may pass are retried."""
     system, name = _located(url)
-    from fsspec.callbacks import Callback  # pyright: ignore[reportMissingTypeStubs]
-
     for wait in (*WAITS, None):
-        limit = _limit(url, max_bytes)
         try:
             with written_whole(path) as partial:
-                system.get_file(name, str(partial), callback=Callback(hooks={"limit": limit}))
-                limit(None, partial.stat().st_size)
+                system.get_file(name, str(partial))
                 if sha256 and file_sha256(partial) != sha256:
                     raise ValueError("it has another checksum than the dataset's manifest says")
             return
         except FileNotFoundError:
             raise DataError(f"there is no {url}") from None
-        except DataError:
-            raise
         except Exception as error:  # every protocol has its own exceptions
             if isinstance(error, OSError) and error.errno in OF_THE_DISK:
                 raise
@@ -147,19 +137,6 @@ def _fetch(url: str, path: Path, max_bytes: int, sha256: str | None = None) -> N
                 problem = f"{type(error).__name__}: {error}"
                 raise DataError(f"cannot fetch {url}: {problem}") from error
             time.sleep(wait)
-
-
-def _limit(url: str, max_bytes: int) -> Callable[[int | None, int], None]:
-    """A progress callback (total bytes, bytes so far) that refuses large or slow downloads."""
-    began = time.monotonic()
-
-    def check(size: int | None, value: int) -> None:
-        if max(size or 0, value) > max_bytes:
-            raise DataError(f"{url} has more than the {max_bytes} bytes that it may have")
-        if time.monotonic() - began > PATIENCE + value / SLOWEST:
-            raise DataError(f"{url} is too slow: {value} bytes in over {PATIENCE:g} s")
-
-    return check
 
 
 def _located(url: str) -> tuple[Any, str]:

@@ -1,73 +1,179 @@
 """Shards: WebDataset tar files of whole episodes. Equal episodes give equal bytes.
 
 `readme.md.j2` describes the members of an episode, which are stored in the order of `MEMBERS`.
-A reader indexes a shard's headers once and then reads single members at their offsets. It trusts
-nothing: content that acwm never writes is refused with a clear message before it takes memory.
+A reader indexes a shard's headers once and then reads single members at their offsets, each checked
+against the checksum that was written with it. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
+import hashlib
 import io
 import json
-import math
 import os
 import re
 import tarfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Generator, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.video import Limits, decode_masks, decode_video, encode_masks, encode_video
+from acwm_core.data.video import decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.env.episode import Episode, EpisodeSpec
-from acwm_core.errors import AcwmError, DamagedShardError, DataError
-from acwm_core.untrusted import parse_json
+from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.untrusted import parse_json, typed
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
-NAME = re.compile(rf"([a-z_]+-[0-9]{{6,9}})\.({'|'.join(map(re.escape, MEMBERS))})")
-"""Pattern of a member's file name: the episode's key, a dot, and one of `MEMBERS`."""
-ARRAYS = {"actions.npy": np.float32, "contacts.npy": np.int32}
-"""Types of the ``.npy`` members; both have two axes."""
-
-MAX_JSON = 2**20
-"""Largest accepted JSON member in bytes; those that acwm writes have under a thousand."""
+SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
 UNREADABLE = (
     *(ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError),
     *(SyntaxError, tokenize.TokenError),  # from the header of a .npy file
 )
-"""Exceptions that decoding a damaged member raises, besides `zipfile.BadZipFile`."""
+"""Exceptions that decoding a damaged file raises."""
+
+Decoded = TypeVar("Decoded")
+
+
+def shard_name(number: int) -> str:
+    """File name of shard `number`."""
+    return f"shard-{number:05d}.tar"
+
+
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hex digits.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror})") from error
+
+
+@dataclass(frozen=True)
+class ActionSums:
+    """Sums over a shard's actions, which add up across shards; one value per action dimension.
+
+    The last row of an episode's actions is zero and no action; it is not counted.
+    """
+
+    count: int
+    total: list[float]
+    squares: list[float]
+    low: list[float]
+    high: list[float]
+
+    @classmethod
+    def of(cls, episodes: Iterable[NDArray[np.float32]]) -> ActionSums:
+        """The sums over the actions ``[T, A]`` of some episodes, in float64."""
+        actions = np.concatenate([rows[:-1] for rows in episodes]).astype(np.float64)
+        sums = actions.sum(0), (actions**2).sum(0), actions.min(0), actions.max(0)
+        return cls(len(actions), *(each.tolist() for each in sums))
+
+
+@dataclass(frozen=True)
+class ShardRecord:
+    """What a finished shard holds: one line of the manifest of its split."""
+
+    shard: str  # file name
+    first: int  # index of its first episode in the split
+    lengths: tuple[int, ...]  # number of frames of each of its episodes
+    size: int  # bytes of the file
+    sha256: str  # checksum of the file
+    actions: ActionSums  # sums over its actions
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.lengths)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all its episodes together."""
+        return sum(self.lengths)
+
+    @classmethod
+    def of_file(cls, path: Path, first: int) -> ShardRecord:
+        """Describe a shard that nobody recorded, because its writer was killed, by reading it.
+
+        Raises:
+            DataError: it is missing or damaged.
+        """
+        reader = open_shard(path)
+        actions = [reader.array(position, "actions.npy") for position in range(len(reader))]
+        size, lengths = path.stat().st_size, tuple(map(len, actions))
+        return cls(path.name, first, lengths, size, file_sha256(path), ActionSums.of(actions))
+
+    def to_json(self) -> str:
+        """One JSON line; `episodes` and `frames` are only for people who read the file."""
+        fields = asdict(self) | {"episodes": self.episodes, "frames": self.frames}
+        return json.dumps(fields, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, line: str) -> ShardRecord:
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError: it is not a record, or its shard lies in another folder.
+        """
+        record = typed(parse_json(line), cls)
+        if not SHARD.fullmatch(record.shard):
+            raise ValueError(f"{record.shard!r} is not the name of a shard")
+        return record
+
+
+class _Summed:
+    """A file that is only written to, with its size and checksum."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self.size, self.sha256 = file, 0, hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        self.sha256.update(data)
+        self.size += len(data)
+        return self._file.write(data)
 
 
 def write_shard(
     path: Path, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
-) -> None:
+) -> ShardRecord:
     """Write `episodes` to the tar file `path`, which appears only once it is complete.
 
     Args:
         path: final name; its folder must exist.
-        episodes: taken one at a time, so a lazy iterable needs memory for only one.
+        episodes: successive ones, taken one at a time, so a lazy iterable needs memory for only
+            one.
+
+    Returns:
+        The record of the shard, for the manifest of its split.
     """
     from webdataset.writer import TarWriter  # pyright: ignore  (imports torch)
 
-    with (
-        written_whole(path) as partial,
-        partial.open("wb") as file,
-        TarWriter(file, encoder=False, user="", group="", mode=0o644, mtime=0) as tar,
-    ):
-        for episode in episodes:
-            key = f"{episode.spec.split}-{episode.spec.index:06d}"
-            for name, data in pack(episode, fps, versions).items():
-                tar.write({"__key__": key, name: data})  # one by one, to keep their order
+    actions, first = list[NDArray[np.float32]](), 0
+    with written_whole(path) as partial, partial.open("wb") as opened:
+        file = _Summed(opened)
+        with TarWriter(
+            cast(Any, file), encoder=False, user="", group="", mode=0o644, mtime=0
+        ) as tar:
+            for episode in episodes:
+                key = f"{episode.spec.split}-{episode.spec.index:06d}"
+                for name, data in pack(episode, fps, versions).items():
+                    tar.write({"__key__": key, name: data})  # one by one, to keep their order
+                first = first if actions else episode.spec.index
+                actions.append(episode.actions)
+    lengths, sums = tuple(map(len, actions)), ActionSums.of(actions)
+    return ShardRecord(path.name, first, lengths, file.size, file.sha256.hexdigest(), sums)
 
 
 def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, bytes]:
@@ -136,56 +242,41 @@ class ShardReader:
             raise damaged_shard(self.path, f"{name} of episode {position} has another checksum")
         return data
 
-    @contextlib.contextmanager
-    def decoding(self, position: int, name: str) -> Generator[bytes]:
-        """Yield the bytes of `read`; errors of the block in decoding become `DamagedShardError`."""
+    def decoded(self, position: int, name: str, decode: Callable[[bytes], Decoded]) -> Decoded:
+        """What `decode` makes of the bytes of `read`."""
         data = self.read(position, name)
         try:
-            yield data
-        except (AcwmError, zipfile.BadZipFile, *UNREADABLE) as error:
+            return decode(data)
+        except (DataError, zipfile.BadZipFile, *UNREADABLE) as error:
             raise damaged_shard(self.path, f"{name} of episode {position}: {error}") from error
 
     def array(self, position: int, name: str) -> NDArray[Any]:
-        """A ``.npy`` member; pickled objects are refused."""
-        with self.decoding(position, name) as data:
-            array = from_npy(data)
-            if array.dtype != ARRAYS[name] or array.ndim != 2:
-                raise ValueError(f"it is {array.dtype} {array.shape}")
-            return array
+        """A ``.npy`` member."""
+        return self.decoded(position, name, from_npy)
 
     def about(self, position: int) -> dict[str, Any]:
         """The ``json`` member: spec, factors, ood_label, versions, crc32."""
-        with self.decoding(position, "json") as data:
-            if len(data) > MAX_JSON:
-                raise ValueError(f"it has {len(data)} bytes")
+        wanted = ("spec", "factors", "ood_label", "versions", "crc32")
+
+        def parsed(data: bytes) -> dict[str, Any]:
             about = parse_json(data)
-            if not (isinstance(about, dict) and isinstance(about["crc32"], dict)):
-                raise ValueError("it, or its crc32, is not a JSON object")
-            wanted = ("spec", "factors", "ood_label", "versions", "crc32")
             return {name: about[name] for name in wanted}
 
-    def episode(self, position: int, size: tuple[int, int] | None = None) -> Episode:
-        """Read and decode one whole episode.
+        return self.decoded(position, "json", parsed)
 
-        Args:
-            position: its position in the shard, from 0.
-            size: height and width of its frames, if known; a video of another size is refused
-                before it is decoded.
-        """
+    def episode(self, position: int) -> Episode:
+        """Read and decode one whole episode."""
         about = self.about(position)
-        actions = self.array(position, "actions.npy")
-        limits = Limits(len(actions), size)
-        with self.decoding(position, "video.mkv") as data:
-            video = decode_video(data, limits=limits)
-        with self.decoding(position, "mask.mkv") as data:
-            masks = decode_masks(data, limits=limits)
-        with self.decoding(position, "states.npz") as data:
-            states = from_npz(data)
-        contacts = self.array(position, "contacts.npy")
-        with self.decoding(position, "json"):
-            spec = EpisodeSpec.from_dict(about["spec"])
-            factors, label = about["factors"], about["ood_label"]
-            return Episode(spec, video, actions, states, masks, contacts, factors, label)
+        return Episode(
+            spec=EpisodeSpec.from_dict(about["spec"]),
+            video=self.decoded(position, "video.mkv", decode_video),
+            actions=self.array(position, "actions.npy"),
+            states=self.decoded(position, "states.npz", from_npz),
+            masks=self.decoded(position, "mask.mkv", decode_masks),
+            contacts=self.array(position, "contacts.npy"),
+            factors=about["factors"],
+            ood_label=about["ood_label"],
+        )
 
 
 def open_shard(path: Path) -> ShardReader:
@@ -204,34 +295,17 @@ def open_shard(path: Path) -> ShardReader:
 @functools.lru_cache(maxsize=4096)
 def _index(path: Path, size: int, modified: int) -> ShardReader:
     episodes: dict[str, dict[str, Member]] = {}
+    names: list[str] = []
     try:
-        with path.open("rb") as file:
-            # Parse headers one by one. `tarfile` would read tar extensions of any size.
-            while any(block := file.read(tarfile.BLOCKSIZE)):  # tars end with empty blocks
-                if len(block) < tarfile.BLOCKSIZE:
-                    break
-                info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
-                offset = file.tell()
-                found = NAME.fullmatch(info.name)
-                if found is None:
-                    raise ValueError(f"it holds {info.name[:80]!r}, not part of an episode")
-                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
-                    raise ValueError(f"{info.name} is a link or another special file")
-                if not 0 <= info.size <= size - offset:
-                    raise ValueError(f"its end is cut off: it ends within {info.name}")
-                key, name = found.groups()
-                members = episodes.setdefault(key, {})
-                if name in members:
-                    raise ValueError(f"it holds {info.name} twice")
-                members[name] = Member(offset, info.size)
-                file.seek(offset + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
-            if len(block) < tarfile.BLOCKSIZE:
-                raise ValueError("its end is cut off")
+        with tarfile.open(path, "r:") as tar:
+            for info in tar:
+                key, _, name = info.name.partition(".")
+                episodes.setdefault(key, {})[name] = Member(info.offset_data, info.size)
+                names.append(info.name)
     except (tarfile.TarError, ValueError) as error:
         raise damaged_shard(path, str(error)) from error
     except OSError as error:
         raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
-    names = (f"{key}.{name}" for key, members in episodes.items() for name in members)
     return ShardReader(path, tuple(episodes.values()), tuple(names))
 
 
@@ -254,21 +328,8 @@ def to_npy(array: NDArray[Any]) -> bytes:
 
 
 def from_npy(data: bytes) -> NDArray[Any]:
-    """The array in a ``.npy`` file of version 1; its size in bytes must match the header."""
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"it is a .npy file of version {version}")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.hasobject:
-        raise ValueError("it holds pickled objects, which are never loaded")
-    if dtype.kind not in "biuf":
-        raise ValueError(f"it holds {dtype}, not numbers")
-    held, claimed = len(data) - stream.tell(), math.prod(shape) * dtype.itemsize
-    if held != claimed or min(shape, default=0) < 0:
-        raise ValueError(f"it claims {dtype} {shape}, {claimed} bytes, and holds {held}")
-    flat = np.frombuffer(data, dtype, offset=stream.tell())
-    return flat.reshape(shape, order="F" if fortran else "C").copy()
+    """The array in a ``.npy`` file."""
+    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -281,15 +342,6 @@ def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of an uncompressed ``.npz``, whose size in bytes must match what it claims."""
-    arrays: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        infos = archive.infolist()
-        if sum(info.file_size for info in infos) > len(data):
-            raise ValueError(f"it claims more than its {len(data)} bytes can hold")
-        for info in infos:
-            name = info.filename.removesuffix(".npy")
-            if info.compress_type != zipfile.ZIP_STORED or name in arrays:
-                raise ValueError(f"{info.filename!r} is compressed, or there twice")
-            arrays[name] = from_npy(archive.read(info))
-    return arrays
+    """The arrays in an ``.npz`` file, by name."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return dict(arrays)

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import ShardRecord
-from acwm_core.data.shards import open_shard, write_shard
+from acwm_core.data.shards import ShardRecord, open_shard, write_shard
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
@@ -180,8 +179,8 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
         report(record.episodes)
         return task.split, record
     with writing(task.path):
-        write_shard(task.path, counted(), task.card.environment.fps, task.card.versions)
-    return task.split, ShardRecord.of_file(task.path, task.first)
+        fps, versions = task.card.environment.fps, task.card.versions
+        return task.split, write_shard(task.path, counted(), fps, versions)
 
 
 def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:

@@ -47,7 +47,6 @@ MP4 = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 KEYFRAMES = 16
 """Number of frames from one key frame of a video to the next."""
 
-PADDING = 128  # pixels that a decoder may add to the height or width
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -73,37 +72,32 @@ def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
     return encode_frames(masks, masks.shape[1:], MASK, fps, keyframes=len(masks))
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a video. Decoding a larger one is refused before it takes memory."""
-
-    frames: int  # maximum number of frames
-    size: tuple[int, int] | None = None  # height and width of its frames; any by default
-
-
-def decode_planes(
-    data: bytes, start: int = 0, stop: int | None = None, limits: Limits | None = None
-) -> NDArray[np.uint8]:
+def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
     """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, 3, H, W]`` uint8.
 
     Raises:
-        DataError: the bytes are not a video, it ends before `stop` or exceeds `limits`.
+        DataError: the bytes are not a video, or it ends before `stop`.
     """
     decoded: list[NDArray[np.uint8]] = []
-    for frame in _decode(data, start, stop, limits):
+    for frame in _decode(data, start, stop):
         decoded.append(np.empty((3, frame.height, frame.width), np.uint8))
         _copy_planes(frame, decoded[-1])
     return _complete(decoded, start, stop)
 
 
-def decode_into(target: NDArray[np.uint8], data: bytes, start: int, limits: Limits) -> None:
+def decode_into(target: NDArray[np.uint8], data: bytes, start: int) -> None:
     """Decode from frame `start` on until `target` ``[T, 3, H, W]`` uint8 is full.
 
-    This fills a batch with a single copy of each pixel. Raises the errors of `decode_planes`.
+    This fills a batch with a single copy of each pixel.
+
+    Raises:
+        DataError: the bytes are not a video of this size, or it ends before `target` is full.
     """
-    limits = Limits(limits.frames, (target.shape[2], target.shape[3]))
     index = -1
-    for index, frame in enumerate(_decode(data, start, start + len(target), limits)):
+    for index, frame in enumerate(_decode(data, start, start + len(target))):
+        if (frame.height, frame.width) != target.shape[2:]:
+            height, width = target.shape[2:]
+            raise DataError(f"its frames are {frame.height}×{frame.width}, not {height}×{width}")
         _copy_planes(frame, target[index])
     if index + 1 != len(target):
         raise DataError(f"it ends before frame {start + len(target)}: {index + 1} frames decoded")
@@ -118,18 +112,14 @@ def _copy_planes(frame: av.VideoFrame, target: NDArray[np.uint8]) -> None:
         target[:] = image.transpose(2, 0, 1)
 
 
-def decode_video(
-    data: bytes, start: int = 0, stop: int | None = None, limits: Limits | None = None
-) -> NDArray[np.uint8]:
+def decode_video(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
     """`decode_planes` as ``[T, H, W, 3]`` uint8."""
-    planes = decode_planes(data, start, stop, limits)
-    return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
+    return np.ascontiguousarray(decode_planes(data, start, stop).transpose(0, 2, 3, 1))
 
 
-def decode_masks(data: bytes, limits: Limits | None = None) -> NDArray[np.uint8]:
+def decode_masks(data: bytes) -> NDArray[np.uint8]:
     """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; errors as in `decode_planes`."""
-    frames = _decode(data, 0, None, limits)
-    return _complete([plane_of(frame, 0).copy() for frame in frames], 0, None)
+    return _complete([plane_of(frame, 0).copy() for frame in _decode(data, 0, None)], 0, None)
 
 
 def write_mp4(
@@ -195,38 +185,22 @@ def encode_frames(
     return buffer.getvalue()
 
 
-def _decode(
-    data: bytes, start: int, stop: int | None, limits: Limits | None
-) -> Iterator[av.VideoFrame]:
+def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame]:
     """Decode frames in order, in one thread, because loaders run many decoders in parallel."""
     source: Any
-    told: dict[str, Any]
-    most: dict[str, str] = {}
-    if limits and limits.size:  # FFmpeg's own limit, if a frame is larger than the container says
-        most["max_pixels"] = str((limits.size[0] + PADDING) * (limits.size[1] + PADDING))
     try:
-        told = {"options": most, "metadata_errors": "replace"}  # in titles and the like
-        with av.open(io.BytesIO(data), "r", format="matroska", **told) as source:
-            if not source.streams.video:
-                raise DataError("it holds no video stream")
+        with av.open(io.BytesIO(data), "r", format="matroska") as source:
             stream = source.streams.video[0]
-            if stream.codec_context is None:
-                raise DataError("it is of a codec that is not known")
             stream.codec_context.thread_count = 1
             # Report damage instead of concealing it.
-            stream.codec_context.options = {"err_detect": "explode", **most}
-            _check_size(stream.height, stream.width, limits)
-            index = 0
-            frames = source.decode(stream)
+            stream.codec_context.options = {"err_detect": "explode"}
+            index, frames = 0, source.decode(stream)
             if start >= KEYFRAMES:
                 first, index = _sought(source, stream, start)
                 frames = itertools.chain([first], source.decode(stream))
             for frame in frames:
                 if stop is not None and index >= stop:
                     return
-                if limits and index >= limits.frames:
-                    raise DataError(f"it has more than {limits.frames} frames")
-                _check_size(frame.height, frame.width, limits)
                 if index >= start:
                     yield frame
                 index += 1
@@ -234,18 +208,12 @@ def _decode(
         raise DataError(f"it cannot be decoded ({error.strerror})") from error
 
 
-def _check_size(height: int, width: int, limits: Limits | None) -> None:
-    if limits and limits.size and (height, width) != tuple(limits.size):
-        raise DataError(f"its frames are {height}×{width}, not {limits.size[0]}×{limits.size[1]}")
-
-
 def _sought(source: Any, stream: Any, start: int) -> tuple[av.VideoFrame, int]:
+    """The first frame from the last key frame before `start` on, and its index."""
     rate = stream.average_rate
-    if not rate:
-        raise DataError("it has no frame rate")
     source.seek(int((start + 0.5) / rate / stream.time_base), stream=stream)
     first = next(source.decode(stream), None)
-    if first is None or first.pts is None:
+    if first is None:
         raise DataError(f"it ends before frame {start}")
     return first, round(first.pts * stream.time_base * rate)
 

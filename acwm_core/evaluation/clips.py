@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.clips import window_actions
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import SPLITS, Episode
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig

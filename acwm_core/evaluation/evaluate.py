@@ -15,7 +15,7 @@ import torch
 
 from acwm_core.data.atomic import held, writing, written_whole
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard

@@ -18,8 +18,8 @@ from typing import Any
 import torch
 
 import acwm_core
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import ClipResult, read_rows, write_results
 from acwm_core.evaluation.clips import ClipPlan, Predictor

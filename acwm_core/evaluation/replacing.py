@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Generator
 from pathlib import Path
 
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import SUMMARY, VIDEOS
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.environment import ActionSpec, Environment
 from acwm_core.errors import AcwmError, DataError

@@ -14,6 +14,7 @@ from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.metrics import MetricConfig, class_of_library, metric_configs
 from acwm_core.recipe.signature import REQUIRED, Signature, signature
+from acwm_core.renamed import without_removed
 
 LIGHT = {
     "training": "acwm_core.training.config:TrainingConfig",
@@ -24,6 +25,14 @@ LIGHT = {
 
 SECTIONS = {"flow": "acwm_core.model.flow:Flow", **LIGHT}
 """For each section that is neither a component nor `trainer`, the class that gets its values."""
+
+REMOVED = {
+    "data": {
+        "skip_damaged": "a damaged shard stops with its name; delete it and run the command that "
+        "made it again"
+    }
+}
+"""What takes the place of parameters that old recipes set, by section and name."""
 
 FITTED = {
     "model": ("latent_channels",),
@@ -82,6 +91,8 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     values = {section: dict(_mapping(section, recipe.get(section) or {})) for section in plain}
     for section, target in LIGHT.items():
         config = resolve_name(target)
+        removed = REMOVED.get(section, {})
+        values[section] = without_removed(values[section], removed, f"{section}.")
         values[section] = _check(section, signature(config), values[section])
         config(**values[section])  # checks ranges and combinations, which types cannot express
     values["trainer"] = _ordered_flags(values["trainer"])

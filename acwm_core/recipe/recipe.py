@@ -15,7 +15,6 @@ from acwm_core.recipe.text import dump
 
 FREE_TO_CHANGE = (
     "data.batch_size",
-    "data.skip_damaged",
     "data.workers",
     "evaluation.",
     "trainer.accelerator",

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import lightning as L
-import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
 
-from acwm_core.data.clips import DataConfig, hold_out, take_fraction
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, Clips, EpisodeDataset
-from acwm_core.data.latents import LatentClipDataset, compresses
-from acwm_core.data.loader import Fetching, Replacements, ResumableLoader
-from acwm_core.data.streaming_reader import StreamingLoader
-from acwm_core.errors import AcwmWarning, DataError, TrainingError
+from acwm_core.data.clips import ClipDataset, DataConfig, hold_out, take_fraction
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
+from acwm_core.data.loader import ClipLoader, ClipSampler, InOrder
+from acwm_core.data.streaming import ClipStream
+from acwm_core.errors import AcwmWarning, TrainingError
 from acwm_core.model.codec import Codec
 
 NOT_RESUMABLE = (
@@ -41,6 +37,7 @@ class ClipData(L.LightningDataModule):
             has.
 
     Args:
+        episodes: the split `train`.
         codec: frozen; encodes the clips once if the recipe caches latents.
     """
 
@@ -70,7 +67,7 @@ class ClipData(L.LightningDataModule):
         if not held_out or not clips:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
         starts = self._clips(held_out, self._once, cached=False, per_length=clips)
-        shown = next(iter(InOrder(starts, clips, self.config.skip_damaged)))
+        shown = next(iter(ClipLoader(starts, InOrder(starts.lengths, clips))))
         return shown["video"], shown["actions"]
 
     def setup(self, stage: str) -> None:
@@ -83,7 +80,6 @@ class ClipData(L.LightningDataModule):
                 self.codec,
                 frames=self.frames,
                 stride=self._stride,
-                skip_damaged=self.config.skip_damaged,
                 progress=trainer.is_global_zero,
             )
         training, validation = self._split
@@ -91,39 +87,38 @@ class ClipData(L.LightningDataModule):
         self._train = self._clips(training, self._stride, cached=self._cached, per_length=count)
         self._validation = self._clips(validation, self._stride, cached=self._cached)
 
-    def train_dataloader(self) -> Endless:
+    def train_dataloader(self) -> ClipLoader:
         """The stream of clips, starting after those of the steps done so far."""
-        trainer = self._trainer()
-        settings: dict[str, Any] = {
-            "batch_size": self.config.batch_size,
-            "rank": trainer.global_rank,
-            "world_size": trainer.world_size,
-            "workers": self.config.workers,
-            "pin_memory": trainer.strategy.root_device.type == "cuda",
-            "skip_damaged": self.config.skip_damaged,
-        }
+        trainer, config, seed = self._trainer(), self.config, self.seed
         if self._streams:
             if trainer.is_global_zero:
                 warnings.warn(NOT_RESUMABLE, AcwmWarning, stacklevel=2)
-            loader = StreamingLoader(
-                cast(ClipDataset, self._train),
-                seed=self.seed + trainer.global_step,  # so that a resumed run sees another order
-                shuffle_buffer=self.config.shuffle_buffer,
-                **settings,
+            seed += trainer.global_step  # so that a resumed run sees another order
+        sampler = ClipSampler(
+            len(self._train),
+            batch_size=config.batch_size,
+            seed=seed,
+            rank=trainer.global_rank,
+            world_size=trainer.world_size,
+            lengths=self._train.lengths,
+            accumulated=trainer.accumulate_grad_batches,
+        )
+        sampler.position = trainer.global_step * self.clips_per_step
+        clips = self._train
+        if self._streams and isinstance(clips, ClipDataset):
+            clips = ClipStream(
+                clips, sampler, shuffle_buffer=config.shuffle_buffer, workers=config.workers
             )
-        else:
-            accumulated = trainer.accumulate_grad_batches
-            loader = ResumableLoader(
-                self._train, seed=self.seed, accumulated=accumulated, **settings
-            )
-        loader.sampler.position = trainer.global_step * self.clips_per_step
-        return Endless(loader)
+        on_gpu = trainer.strategy.root_device.type == "cuda"
+        return ClipLoader(clips, sampler, workers=config.workers, pin_memory=on_gpu)
 
-    def val_dataloader(self) -> InOrder | list[Any]:
+    def val_dataloader(self) -> ClipLoader | list[Any]:
         """The held-out clips in order; every rank uses all, so that all agree on the loss."""
         if not len(self._validation):
             return []
-        return InOrder(self._validation, self.config.batch_size, self.config.skip_damaged)
+        return ClipLoader(
+            self._validation, InOrder(self._validation.lengths, self.config.batch_size)
+        )
 
     def state_dict(self) -> dict[str, int]:
         """Clips per optimiser step; with the number of steps this gives the place in the stream."""
@@ -167,64 +162,4 @@ class ClipData(L.LightningDataModule):
         }
         if not cached:
             return ClipDataset(self.episodes, **windows)
-        skip_damaged, name = self.config.skip_damaged, self.codec.fingerprint()
-        return LatentClipDataset(self.episodes, name, skip_damaged=skip_damaged, **windows)
-
-
-class Endless:
-    """The batches of a loader, with ``"positions"``: the places of their clips in the stream."""
-
-    def __init__(self, loader: ResumableLoader | StreamingLoader) -> None:
-        self._loader = loader
-
-    def __iter__(self) -> Iterator[Any]:
-        """Batches without end.
-
-        Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
-        """
-        sampler = self._loader.sampler
-        try:
-            for batch in self._loader:  # the loader has already moved to the next step's position
-                start = sampler.position - sampler.clips_per_step
-                start += sampler.rank * sampler.batch_size
-                positions = tuple(range(start, start + sampler.batch_size))
-                yield {**batch, "positions": positions}
-        except DataError as error:
-            # Only the first process reports errors, but it does not know of this one: print here.
-            if sampler.rank:
-                sys.stderr.write(f"acwm: {error}\n")
-            raise
-
-
-class InOrder:
-    """The clips of a dataset in order, longest first.
-
-    Each batch holds clips of one length; the last batch of a length may be smaller.
-    """
-
-    def __init__(self, clips: Clips, batch_size: int, skip_damaged: bool) -> None:
-        lengths = clips.lengths
-        groups = [np.flatnonzero(lengths == length) for length in np.unique(lengths)[::-1]]
-        self._batches: list[list[int]] = [
-            group[start : start + batch_size].tolist()
-            for group in groups
-            for start in range(0, len(group), batch_size)
-        ]
-        self._loader = DataLoader(
-            Fetching(clips, skip_damaged=skip_damaged), batch_size=None, sampler=self._batches
-        )
-        self._replaced = Replacements()
-
-    def __len__(self) -> int:
-        """The number of batches."""
-        return len(self._loader)
-
-    def __iter__(self) -> Iterator[Any]:
-        """Iterate over the batches, with ``"positions"``: the places of their clips in the dataset.
-
-        Raises:
-            DataError: a shard is missing, or damaged and not to be skipped.
-        """
-        for places, fetched in zip(self._batches, self._loader, strict=True):
-            yield {**self._replaced.batch_of(fetched), "positions": tuple(places)}
+        return LatentClipDataset(self.episodes, self.codec.fingerprint(), **windows)

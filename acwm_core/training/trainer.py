@@ -21,8 +21,8 @@ from lightning.pytorch.strategies import (
     ModelParallelStrategy,
 )
 
-from acwm_core.data.encoding import cpu_has_fast_bfloat16
 from acwm_core.errors import RecipeError, TrainingError
+from acwm_core.model.codec import cpu_has_fast_bfloat16
 from acwm_core.training.config import TrainingConfig, chosen_loggers
 from acwm_core.training.sharding import CheckpointFiles, ShardedStrategy
 

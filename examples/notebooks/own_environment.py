@@ -126,7 +126,7 @@ picture
 # A package registers its environment with an entry point. A notebook adds it to the catalog.
 
 # %%
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.plugins import catalog, hookimpl
 

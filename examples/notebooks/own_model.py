@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.model.build import build_world_model
 from acwm_core.model.dynamics import DynamicsModel

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged

@@ -14,7 +14,7 @@ from PIL import Image
 
 from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import UNREADABLE, from_npy
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import write_mp4

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal, Task, TaskEnvironment

@@ -11,17 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import (
-    MANIFEST,
-    Manifest,
-    ShardRecord,
-    action_statistics,
-    file_sha256,
-    shard_name,
-)
+from acwm_core.data.card import MANIFEST, DatasetCard
+from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.remote import fetch_shard, origin
-from acwm_core.data.shards import MEMBERS, open_shard
+from acwm_core.data.shards import MEMBERS, ShardRecord, file_sha256, open_shard, shard_name
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.card import check_episode
 from acwm_core.env.episode import Episode, Split
@@ -124,7 +117,7 @@ def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
 def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Split) -> None:
     url = origin(path.parents[1])
     if url and not path.exists():
-        fetch_shard(f"{url}/{split}/{path.name}", path, record)
+        fetch_shard(f"{url}/{split}/{path.name}", path, record.sha256)
     expect(path.is_file(), "the file is missing")
     expect(path.stat().st_size == record.size, f"the file does not have {record.size} bytes")
     same = file_sha256(path) == record.sha256
@@ -138,7 +131,7 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         expect(same, f"episode {index} has another spec than the card")
-        episode = reader.episode(position, card.environment.frame_size)
+        episode = reader.episode(position)
         frames, said = len(episode.video), record.lengths[position]
         expect(frames == said, f"episode {index} has {frames} frames, the manifest says {said}")
         try:

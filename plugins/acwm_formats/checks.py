@@ -14,7 +14,7 @@ import numpy as np
 
 from acwm_core.checks.result import Suite, expect, expect_is_a
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.formats import DatasetExporter, DatasetImporter, export_dataset, options_of
 from acwm_core.data.recordings import RecordedDataset, Recording, import_dataset, recorded_card
 from acwm_core.env.environment import ActionSpec

@@ -9,6 +9,9 @@ import click
 
 from acwm_core.cli.arguments import DATASET, split_parameters
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.renamed import without_removed
+
+REMOVED = {"--skip-damaged": "a damaged shard stops with its name; make it again and encode then"}
 
 
 @click.command()
@@ -27,13 +30,14 @@ from acwm_core.errors import DataError, RecipeError
 @click.option(
     "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
 )
-@click.option("--skip-damaged", is_flag=True, help="Skip episodes of damaged shards.")
+@click.option("--skip-damaged", is_flag=True, hidden=True)
 def encode(
     data: Path,
     overrides: tuple[str, ...],
     name: str,
     split: str,
     device: str,
+    skip_damaged: bool,
     **windows: Any,
 ) -> None:
     """Encode the clips of a dataset as latents.
@@ -45,13 +49,14 @@ def encode(
     If it is interrupted, run the same command again to continue. Several commands share the work,
     also on several machines with a shared folder.
     """
+    without_removed({"--skip-damaged": skip_damaged}, REMOVED)
     others, parameters = split_parameters("codec", name, overrides)
     if others:
         raise RecipeError(f"{others[0]!r} sets no parameter of the codec; write codec.NAME=VALUE")
 
     from acwm_core.data.card import DatasetCard
-    from acwm_core.data.encoding import encode_windows
-    from acwm_core.data.episodes import EpisodeDataset
+    from acwm_core.data.dataset import EpisodeDataset
+    from acwm_core.data.latents import encode_windows
     from acwm_core.evaluation.evaluate import choose_device
     from acwm_core.model.build import build_codec
     from acwm_core.recipe import ComponentConfig

@@ -14,8 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.manifest import Manifest
+from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.video import write_mp4
 from acwm_core.env.episode import Split
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.physics import Gap, StateEstimator

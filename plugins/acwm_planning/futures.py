@@ -10,13 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.data.encoding import cpu_has_fast_bfloat16
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
-from acwm_core.model.codec import Codec
+from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel

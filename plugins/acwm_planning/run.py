@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import EpisodeSpec

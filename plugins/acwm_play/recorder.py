@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from acwm_core.data.atomic import held, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions
-from acwm_core.data.manifest import Manifest, ShardRecord, action_statistics, shard_name
+from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
-from acwm_core.data.shards import write_shard
+from acwm_core.data.shards import shard_name, write_shard
 from acwm_core.data.video import write_mp4
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import EnvironmentCard
@@ -119,9 +119,9 @@ def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
     shards.mkdir(exist_ok=True)
     episode = recording.episode(wanted.spec("train", count))
     check_episode(episode, wanted.environment)
-    write_shard(shards / shard_name(count), [episode], card.fps, wanted.versions)
+    record = write_shard(shards / shard_name(count), [episode], card.fps, wanted.versions)
     manifest = Manifest(shards)
-    manifest.add(ShardRecord.of_file(shards / shard_name(count), count))
+    manifest.add(record)
     manifest.finish()
     made = dataclasses.replace(
         wanted,

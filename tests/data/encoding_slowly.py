@@ -10,8 +10,8 @@ from pathlib import Path
 
 from blocks import Blocks
 
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.latents import encode_windows
 
 FRAMES = 9
 

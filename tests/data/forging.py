@@ -13,7 +13,9 @@ import av
 import numpy as np
 import yaml
 
-from acwm_core.data.manifest import MANIFEST, Manifest, ShardRecord, action_statistics
+from acwm_core.data.card import MANIFEST
+from acwm_core.data.dataset import Manifest, action_statistics
+from acwm_core.data.shards import ShardRecord
 from acwm_core.errors import DataError
 from acwm_formats.check import check_dataset
 
@@ -112,7 +114,9 @@ def sign(folder, split="train", number=0, **values):
         lines[number]["size"] = path.stat().st_size
         lines[number]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
         with contextlib.suppress(DataError, ValueError):  # of what is no shard any more
-            lines[number]["actions"] = asdict(ShardRecord.of_file(path, 0).actions)
+            sums = asdict(ShardRecord.of_file(path, 0).actions)
+            json.dumps(sums, allow_nan=False)
+            lines[number]["actions"] = sums
     lines[number] |= values
     manifest.write_text("".join(json.dumps(line) + "\n" for line in lines))
     card = yaml.safe_load((folder / "card.yaml").read_text())

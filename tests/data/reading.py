@@ -19,8 +19,9 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.loader import ClipLoader, ClipSampler
 
 CLIPS = 120
 """How many a reader that is not killed reads in all."""
@@ -39,8 +40,10 @@ def fingerprints(batch):
 
 def loaders_of(data, ranks, batch_size, workers):
     """A loader per rank."""
-    settings = {"batch_size": batch_size, "seed": 7, "world_size": ranks, "workers": workers}
-    loaders = [ResumableLoader(clips_of(data), rank=rank, **settings) for rank in range(ranks)]
+    clips = clips_of(data)
+    settings = {"batch_size": batch_size, "seed": 7, "world_size": ranks}
+    samplers = [ClipSampler(len(clips), rank=rank, **settings) for rank in range(ranks)]
+    loaders = [ClipLoader(clips, sampler, workers=workers) for sampler in samplers]
     for loader in loaders:
         if workers:  # spawned ones would import torch for seconds
             loader._loader.multiprocessing_context = "fork"
@@ -51,9 +54,9 @@ def rank_main(rank, ranks, workers, data, folder):
     """One rank of a real process group; a rank that takes fewer steps would hang the others."""
     torch.set_num_threads(1)
     dist.init_process_group("gloo", f"file://{folder}/group", rank=rank, world_size=ranks)
-    loader = ResumableLoader(
-        clips_of(data), batch_size=3, seed=7, rank=rank, world_size=ranks, workers=workers
-    )
+    clips = clips_of(data)
+    sampler = ClipSampler(len(clips), batch_size=3, seed=7, rank=rank, world_size=ranks)
+    loader = ClipLoader(clips, sampler, workers=workers)
     steps = []
     for batch in itertools.islice(loader, 2 * CLIPS // (3 * ranks)):
         everyone = [None] * ranks
@@ -70,16 +73,16 @@ def read(data, folder, ranks, batch_size, workers):
     saved = folder / "state.json"
     if saved.exists():
         for loader in loaders:
-            loader.sampler.position = int(saved.read_text())
+            loader.order.position = int(saved.read_text())
     log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    place = loaders[0].sampler.position
+    place = loaders[0].order.position
     for step, batches in enumerate(zip(*loaders, strict=True)):
         for batch in batches:
             for clip in fingerprints(batch):
                 os.write(log, f"{place} {clip}\n".encode())
                 place += 1
         if step % 3 == 2:
-            saved.with_suffix(".new").write_text(str(loaders[0].sampler.position))
+            saved.with_suffix(".new").write_text(str(loaders[0].order.position))
             saved.with_suffix(".new").replace(saved)
         if place >= CLIPS:
             return

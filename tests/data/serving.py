@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-import time
 from collections import Counter
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -15,8 +14,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         asked: how often each path was asked for.
         faults: per path a list of what to do wrong, the next one first: an error code,
-            ``"cut"``, ``"flip"`` (another last byte), ``"long"``, ``"slow"``, ``"drops"`` (a
-            byte at a time) or ``"stalls"`` (half of it).
+            ``"cut"``, ``"flip"`` (another last byte), ``"slow"`` or ``"stalls"`` (half of it).
         ending: whether nobody needs the rest of what stalls.
     """
 
@@ -49,20 +47,10 @@ class Handler(SimpleHTTPRequestHandler):
     def _send(self, fault):
         data = Path(self.translate_path(self.path)).read_bytes()
         self.send_response(200)
-        if fault == "long":
-            self.end_headers()  # no length: until the connection ends
-            for _ in range(1000):
-                self.wfile.write(data)
-            return
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         if fault == "cut":
             self.wfile.write(data[: len(data) // 2])
-        elif fault == "drops":
-            for byte in data:
-                self.wfile.write(bytes([byte]))
-                self.wfile.flush()
-                time.sleep(0.02)
         elif fault == "flip":
             self.wfile.write(data[:-1] + bytes([data[-1] ^ 1]))
         else:

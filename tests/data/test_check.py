@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from forging import forge, npy, problems
 
-from acwm_core.data.manifest import MANIFEST
+from acwm_core.data.card import MANIFEST
 from acwm_formats.check import check_dataset
 
 
@@ -70,7 +70,7 @@ def test_a_shard_that_was_exchanged_together_with_its_record_is_found(data):
         ),
         (lambda a: np.where(np.arange(len(a))[:, None] == 2, np.float32("nan"), a), "not finite"),
         (lambda a: a[:, :1], "actions are"),
-        (lambda a: a[:-1], "more than 20 frames"),
+        (lambda a: a[:-1], "actions has 20 rows for 21 frames"),
     ],
     ids=["bounds", "nan", "columns", "rows"],
 )

@@ -9,9 +9,15 @@ import pytest
 import torch
 from conftest import EPISODES
 
-from acwm_core.data.clips import DataConfig, hold_out, list_windows, take_fraction, window_starts
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.manifest import Manifest
+from acwm_core.data.clips import (
+    ClipDataset,
+    DataConfig,
+    hold_out,
+    list_windows,
+    take_fraction,
+    window_starts,
+)
+from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.errors import DataError, RecipeError
 

@@ -16,10 +16,10 @@ from conftest import PATIENCE, checksums, wait_until
 from encoding_slowly import FRAMES
 
 from acwm_core.cli import main
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.data.latents import CARD, LatentClipDataset
+from acwm_core.data.latents import CARD, LatentClipDataset, encode_windows
 from acwm_core.errors import DataError
 
 HERE = Path(__file__).parent

@@ -6,7 +6,7 @@ from test_simulate import assert_same
 
 from acwm_core.cli import main
 from acwm_core.data import simulate
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import SPLITS
 from tests.checks.results import installed
 

@@ -7,9 +7,8 @@ from conftest import EPISODES
 from square_world import Square
 
 from acwm_core.cli import main
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.generate import generate
-from acwm_core.data.manifest import Manifest
 from acwm_core.data.simulate import simulate
 from acwm_core.errors import DataError, RecipeError
 

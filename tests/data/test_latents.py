@@ -8,10 +8,10 @@ import pytest
 import torch
 from blocks import Blocks
 
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.data.latents import LatentClipDataset, compresses
+from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
 from acwm_core.errors import DataError, ShapeError
 
 
@@ -79,7 +79,7 @@ def test_latents_that_are_cut_off_while_they_are_read_are_one_sentence(data, res
     latents = encode(data, Blocks(), frames=9)
     last = len(latents) - 1
     assert latents[last]["latents"].isfinite().all()
-    for file in latents._files:
+    for file in data.path.rglob("*.npy"):
         os.truncate(file, int(rest * file.stat().st_size))
     with pytest.raises(DataError, match=r"damaged \(its end is cut off\): delete the file and enc"):
         latents[last]

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from blocks import Blocks
 
-from acwm_core.data.clips import ClipSampler, shared_lengths
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.latents import LatentClipDataset
-from acwm_core.data.loader import Fetching, ResumableLoader
+from acwm_core.data.clips import ClipDataset, shared_lengths
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.latents import LatentClipDataset, encode_windows
+from acwm_core.data.loader import ClipLoader, ClipSampler
 from acwm_core.env.environment import ActionSpec
-from acwm_core.errors import DamagedShardError
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 
@@ -75,14 +73,14 @@ def test_no_batch_mixes_lengths(episodes):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_loader_gives_every_clip_whole_and_resumes(episodes, workers):
     clips = ClipDataset(episodes, frames=13, temporal_stride=4)
-    settings = {"batch_size": 2, "seed": 3, "workers": workers}
-    first, second = (ResumableLoader(clips, **settings) for _ in range(2))
+    samplers = (ClipSampler(9, batch_size=2, seed=3, lengths=LENGTHS) for _ in range(2))
+    first, second = (ClipLoader(clips, sampler, workers=workers) for sampler in samplers)
     whole = [batch["video"].numpy().copy() for batch in itertools.islice(first, 5)]
     order = iter(ClipSampler(9, batch_size=2, seed=3, lengths=LENGTHS))
     for video, indices in zip(whole, order, strict=False):
         assert len(video) == 2
         np.testing.assert_array_equal(video, clips.batch(indices)["video"])
-    second.sampler.position = 3 * 2
+    second.order.position = 3 * 2
     rest = [batch["video"].numpy() for batch in itertools.islice(second, 2)]
     for ours, theirs in zip(rest, whole[3:], strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -128,19 +126,6 @@ def test_equal_lengths_change_nothing():
     plain = iter(ClipSampler(11, batch_size=3, seed=4))
     alike = iter(ClipSampler(11, batch_size=3, seed=4, lengths=[37] * 11))
     assert [next(plain) for _ in range(20)] == [next(alike) for _ in range(20)]
-
-
-def test_a_clip_as_long_replaces_a_damaged_one(episodes):
-    class Damaged(ClipDataset):
-        def batch(self, indices):
-            if 1 in list(indices):
-                raise DamagedShardError("damaged")
-            return super().batch(indices)
-
-    clips = Damaged(episodes, frames=13, temporal_stride=4)
-    fetched = Fetching(clips, skip_damaged=True)[[5, 1, 8]]
-    assert fetched.replaced == ["damaged"]
-    assert fetched.batch["video"].shape[:2] == (3, 9)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.clips import ClipSampler, epoch_order
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.loader import ClipLoader, ClipSampler, InOrder, epoch_order
 
 
 class Numbers:
@@ -21,15 +21,16 @@ class Numbers:
         return len(self.lengths)
 
     def batch(self, indices):
-        return torch.as_tensor(indices)
+        return {"numbers": torch.as_tensor(indices)}
 
 
 def loader(length=23, batch_size=3, **settings):
-    return ResumableLoader(Numbers(length), batch_size=batch_size, seed=5, **settings)
+    sampler = ClipSampler(length, batch_size=batch_size, seed=5, **settings)
+    return ClipLoader(Numbers(length), sampler)
 
 
 def first(loader, count):
-    return [batch.tolist() for batch in itertools.islice(loader, count)]
+    return [batch["numbers"].tolist() for batch in itertools.islice(loader, count)]
 
 
 def stream(length, seed, count):
@@ -63,7 +64,7 @@ def test_resuming_goes_on_exactly_at_any_point():
     for killed_after in np.random.default_rng(0).integers(0, 160, 100).tolist():
         killed, second = loader(), loader()
         seen = first(killed, killed_after)
-        second.sampler.position = killed.sampler.position
+        second.order.position = killed.order.position
         assert seen + first(second, 40) == whole[: killed_after + 40]
 
 
@@ -72,7 +73,7 @@ def test_resuming_with_other_ranks_or_batches_goes_on_with_the_next_clip():
     seen = first(killed, 4)
     halves = [loader(batch_size=3, rank=rank, world_size=2) for rank in range(2)]
     for each in halves:
-        each.sampler.position = killed.sampler.position
+        each.order.position = killed.order.position
     taken = [first(each, 8) for each in halves]
     rest = list(itertools.chain(*(b for step in zip(*taken, strict=True) for b in step)))
     together = list(itertools.chain(*seen)) + rest
@@ -81,20 +82,40 @@ def test_resuming_with_other_ranks_or_batches_goes_on_with_the_next_clip():
 
 def test_batches_fetched_ahead_are_not_counted_as_used(square_data):
     clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
-    killed = ResumableLoader(clips, batch_size=4, seed=1, workers=1)
+    killed = ClipLoader(clips, ClipSampler(len(clips), batch_size=4), workers=1)
     for _ in itertools.islice(killed, 3):
         pass
-    assert killed.sampler.position == 12
+    assert killed.order.position == 12
 
 
 def test_batches_of_workers_are_those_of_this_process(square_data):
     clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4)
-    loaders = [ResumableLoader(clips, batch_size=3, seed=2, workers=n) for n in (0, 2)]
+    loaders = [ClipLoader(clips, ClipSampler(len(clips), batch_size=3), workers=n) for n in (0, 2)]
     alone, shared = ([*itertools.islice(loader, 30)] for loader in loaders)
     for one, other in zip(alone, shared, strict=True):
         assert one.keys() == other.keys()
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_positions_are_the_places_in_the_stream(ranks):
+    """Noise is drawn by them: each clip that is taken has its own, on any number of ranks."""
+    loaders = [loader(rank=rank, world_size=ranks) for rank in range(ranks)]
+    steps = zip(*(itertools.islice(each, 20) for each in loaders), strict=True)
+    batches = [batch for step in steps for batch in step]
+    positions = [place for batch in batches for place in batch["positions"]]
+    assert positions == [*range(60 * ranks)]
+    numbers = [number for batch in batches for number in batch["numbers"].tolist()]
+    np.testing.assert_array_equal(numbers, stream(23, 5, 60 * ranks))
+
+
+def test_in_order_every_clip_comes_once_longest_first():
+    clips = Numbers(5)
+    clips.lengths = np.array([5, 9, 5, 9, 9])
+    batches = [*ClipLoader(clips, InOrder(clips.lengths, 2))]
+    assert [batch["numbers"].tolist() for batch in batches] == [[1, 3], [4], [0, 2]]
+    assert [batch["positions"] for batch in batches] == [(1, 3), (4,), (0, 2)]
 
 
 def test_nothing_to_sample_is_refused():

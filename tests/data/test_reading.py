@@ -11,7 +11,7 @@ import test_loader
 import torch.multiprocessing
 from reading import CLIPS, clips_of, fingerprints, rank_main
 
-from acwm_core.data.clips import epoch_order
+from acwm_core.data.loader import epoch_order
 
 SCRIPT = Path(__file__).with_name("reading.py")
 

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.readme import MARK, README, write_readme
 

@@ -9,10 +9,11 @@ from blocks import Blocks
 from serving import served
 
 from acwm_core.data import remote
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.latents import LatentClipDataset
-from acwm_core.data.streaming_reader import StreamingLoader
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.latents import LatentClipDataset, encode_windows
+from acwm_core.data.loader import ClipLoader, ClipSampler
+from acwm_core.data.streaming import ClipStream
 from acwm_core.errors import DataError
 
 WINDOWS = {"frames": 9, "stride": 4}
@@ -25,6 +26,12 @@ def copied(square_data, tmp_path):
 
 def clips_of(data, **settings):
     return ClipDataset(EpisodeDataset(data, "train"), **WINDOWS, **settings)
+
+
+def streaming(clips, *, workers=0, shuffle_buffer=2000, **batches):
+    sampler = ClipSampler(len(clips), **batches)
+    stream = ClipStream(clips, sampler, shuffle_buffer=shuffle_buffer, workers=workers)
+    return ClipLoader(stream, sampler, workers=workers)
 
 
 def taken(loader, batches):
@@ -45,16 +52,16 @@ def known(clips):
 def test_a_pass_has_every_clip_of_random_access_once(square_data, workers):
     clips = clips_of(square_data)
     numbers = known(clips)
-    loader = StreamingLoader(clips, batch_size=1, seed=3, workers=workers, shuffle_buffer=7)
+    loader = streaming(clips, batch_size=1, seed=3, workers=workers, shuffle_buffer=7)
     if workers:  # which take their passes each in its own time
         assert {numbers[clip] for clip in taken(loader, 12 * len(clips))} == set(range(len(clips)))
         return
     first = [numbers[clip] for clip in taken(loader, len(clips))]
     assert sorted(first) == list(range(len(clips)))
     assert first != sorted(first)
-    again = StreamingLoader(clips, batch_size=1, seed=3, shuffle_buffer=7)
+    again = streaming(clips, batch_size=1, seed=3, shuffle_buffer=7)
     assert [numbers[clip] for clip in taken(again, len(clips))] == first
-    other = StreamingLoader(clips, batch_size=1, seed=4, shuffle_buffer=7)
+    other = streaming(clips, batch_size=1, seed=4, shuffle_buffer=7)
     assert [numbers[clip] for clip in taken(other, len(clips))] != first
 
 
@@ -63,7 +70,7 @@ def test_latents_of_a_streamed_clip_are_the_cached_ones(copied):
     encode_windows(clips.episodes, codec, **WINDOWS, progress=False)
     cached = LatentClipDataset(clips.episodes, codec.fingerprint(), **WINDOWS)
     numbers = known(clips)
-    batch = next(iter(StreamingLoader(clips, batch_size=3, shuffle_buffer=4)))
+    batch = next(iter(streaming(clips, batch_size=3, shuffle_buffer=4)))
     for video, actions in zip(batch["video"], batch["actions"], strict=True):
         index = numbers[video.numpy().tobytes() + actions.numpy().tobytes()]
         latents = codec.encode(video[None].float() / 255)[0]
@@ -74,10 +81,10 @@ def test_ranks_have_shards_of_their_own_and_as_many_steps_as_they_ask_for(square
     clips = clips_of(square_data)
     numbers, seen = known(clips), []
     for rank in range(2):
-        loader = StreamingLoader(clips, batch_size=3, rank=rank, world_size=2, shuffle_buffer=9)
+        loader = streaming(clips, batch_size=3, rank=rank, world_size=2, shuffle_buffer=9)
         drawn = taken(loader, 40)
         assert len(drawn) == 3 * 40
-        assert loader.sampler.position == 40 * 6
+        assert loader.order.position == 40 * 6
         seen.append({numbers[clip] for clip in drawn})
     assert seen[0] | seen[1] == set(range(len(clips)))
     assert not seen[0] & seen[1]
@@ -85,7 +92,7 @@ def test_ranks_have_shards_of_their_own_and_as_many_steps_as_they_ask_for(square
 
 def test_only_chosen_episodes_come(square_data):
     clips = clips_of(square_data, indices=[1, 5])
-    assert {known(clips)[clip] for clip in taken(StreamingLoader(clips, batch_size=2), 20)} == set(
+    assert {known(clips)[clip] for clip in taken(streaming(clips, batch_size=2), 20)} == set(
         range(len(clips))
     )
 
@@ -93,7 +100,7 @@ def test_only_chosen_episodes_come(square_data):
 def test_a_batch_has_clips_of_one_length(square_data):
     clips = ClipDataset(EpisodeDataset(square_data, "train"), frames=9, stride=4, temporal_stride=4)
     clips.lengths[::3] = 5
-    loader = StreamingLoader(clips, batch_size=2, shuffle_buffer=9)
+    loader = streaming(clips, batch_size=2, shuffle_buffer=9)
     lengths = [batch["video"].shape[:2] for batch in itertools.islice(loader, len(clips))]
     assert {tuple(length) for length in lengths} == {(2, 9), (2, 5)}
 
@@ -107,35 +114,24 @@ def test_shards_of_a_url_are_not_kept(square_data, tmp_path, monkeypatch):
     with served(square_data) as server:
         server.faults = {"/train/shard-00001.tar": ["cut", 503]}
         clips = clips_of(server.url)
-        drawn = taken(StreamingLoader(clips, batch_size=1, shuffle_buffer=5), len(clips))
+        drawn = taken(streaming(clips, batch_size=1, shuffle_buffer=5), len(clips))
         server.faults = {f"/train/shard-0000{n}.tar": [404] for n in range(3)}
         with pytest.raises(DataError, match=r"there is no .*shard-0000\d\.tar"):
-            taken(StreamingLoader(clips, batch_size=1), 1)
+            taken(streaming(clips, batch_size=1), 1)
     assert sorted(numbers[clip] for clip in drawn) == list(range(len(numbers)))
     assert not list(tmp_path.rglob("*.tar"))
 
 
 def test_fewer_shards_than_readers_are_refused(square_data):
     with pytest.raises(DataError, match="a shard for each of 4 processes that read, not 3 in all"):
-        StreamingLoader(clips_of(square_data), batch_size=1, world_size=2, workers=2)
+        streaming(clips_of(square_data), batch_size=1, world_size=2, workers=2)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_damage_ends_the_stream_or_is_left_out(copied, workers):
+def test_damage_ends_the_stream_with_the_shards_name(copied, workers):
     shard = copied / "train" / "shard-00001.tar"
     shard.write_bytes(shard.read_bytes()[: shard.stat().st_size // 2])
     clips = clips_of(copied)
     settings = {"batch_size": 1, "workers": workers}
     with pytest.raises(DataError, match=r"shard-00001\.tar is damaged"):
-        taken(StreamingLoader(clips, **settings), 2 * len(clips))
-    loader = StreamingLoader(clips, skip_damaged=True, **settings)
-    with pytest.warns(UserWarning, match=r"shard-00001\.tar is damaged"):
-        drawn = taken(loader, 2 * len(clips))
-    assert len(drawn) == 2 * len(clips)
-
-
-def test_nothing_but_damage_is_an_error(copied):
-    for shard in (copied / "train").glob("*.tar"):
-        shard.write_bytes(shard.read_bytes()[:100])
-    with pytest.raises(DataError, match="all that this process reads is damaged"):
-        taken(StreamingLoader(clips_of(copied), batch_size=1, skip_damaged=True), 1)
+        taken(streaming(clips, **settings), 2 * len(clips))

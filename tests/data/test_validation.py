@@ -10,8 +10,8 @@ import yaml
 from forging import problems
 from square_world import Square
 
+from acwm_core.data.card import MANIFEST
 from acwm_core.data.generate import generate
-from acwm_core.data.manifest import MANIFEST
 from acwm_core.errors import AcwmError, DataError, PluginError
 from acwm_core.plugins import catalog, hookimpl
 

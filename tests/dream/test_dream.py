@@ -10,7 +10,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import acwm
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import ActionError, AcwmError, RecipeError
 from acwm_dream.environment import Dream

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import (
     Batch,

@@ -8,7 +8,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
 from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.clips import derangement, noise_seed, plan_clips

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.evaluation.results import Summary

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from acwm_core.checks.disc import Disc
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.data.atomic import held
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clip_results import EPISODES, read_results
 from acwm_core.evaluation.evaluate import evaluate_run

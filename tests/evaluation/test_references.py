@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation import provenance
 from acwm_core.evaluation.clip_results import read_rows, write_results
 from acwm_core.evaluation.clips import plan_clips

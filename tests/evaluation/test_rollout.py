@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import ActionError, AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels

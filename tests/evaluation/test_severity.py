@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from acwm_core.checks.disc import GAIN, SHADE
 from acwm_core.cli.main import main
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.env.episode import Factor
 from acwm_core.errors import DataError, RecipeError

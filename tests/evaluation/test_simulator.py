@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.checks.disc import Disc
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError

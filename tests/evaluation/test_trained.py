@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.physics import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clip_results import summarise_split
 from acwm_core.evaluation.clips import ClipPlan, plan_clips

@@ -4,7 +4,7 @@ import av
 import numpy as np
 import torch
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.videos import case_study, moving_instances
 

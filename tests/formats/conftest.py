@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.recordings import import_dataset
 from acwm_formats.published import Published

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.formats import export_dataset
 from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError

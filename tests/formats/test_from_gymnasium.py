@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.check import check_dataset

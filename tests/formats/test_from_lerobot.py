@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
 from acwm_formats.check import check_dataset

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
 from acwm_core.plugins import catalog

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats import video
 from acwm_formats.published import Published

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError, ShapeError
 from acwm_formats.arrays import Recording, write_dataset

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from safetensors.torch import load_file
 
 from acwm_core.cli.main import main
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clip_results import read_results, summarise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acwm_core.data.card import CARD
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_formats.check import check_dataset
 from acwm_play.recorder import Recording, save
 from acwm_play.simulator import TimeStep

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.training.run import load_run
 from acwm_core.untrusted import read_json

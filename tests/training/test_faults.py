@@ -14,8 +14,9 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 from acwm_core.data.atomic import held
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
-from acwm_core.data.loader import ResumableLoader
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.loader import ClipLoader, ClipSampler
 from acwm_core.errors import AcwmError, DataError, TrainingError
 from acwm_core.plugins import catalog
 from acwm_core.training.checkpoints import read_details
@@ -97,7 +98,7 @@ def test_a_worker_that_is_killed_is_one_sentence(batch, data, tmp_path, monkeypa
 def test_workers_leave_ctrl_c_to_the_training(data):
     """From their first moment on: they start with the signal blocked."""
     clips = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=2)
-    loader = iter(ResumableLoader(clips, batch_size=2, seed=0, workers=2))
+    loader = iter(ClipLoader(clips, ClipSampler(len(clips), batch_size=2), workers=2))
     next(loader)
     (main, *workers) = [os.getpid(), *(each.pid for each in multiprocessing.active_children())]
     assert len(workers) == 2

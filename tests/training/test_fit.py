@@ -11,7 +11,8 @@ from PIL import Image, ImageSequence
 from tensorboard.backend.event_processing import event_accumulator
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from acwm_core.data.episodes import ClipDataset, EpisodeDataset
+from acwm_core.data.clips import ClipDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.training.callbacks import CpuTime
 from acwm_core.training.fit import fit

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import RecipeError
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.fit import fit

@@ -7,14 +7,15 @@ from types import SimpleNamespace
 import pytest
 
 from acwm_core.data.clips import DataConfig
-from acwm_core.data.encoding import encode_windows
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
+from acwm_core.data.latents import encode_windows
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError, TrainingError
+from acwm_core.renamed import RenamedWarning
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import RunFolder
 from tests.training.test_fit import assert_same
 from tests.training.test_processes import TWO, train
 from tests.training.tiny import Kill, Killed, TinyCodec, tiny_recipe
@@ -62,18 +63,19 @@ def test_training_on_latents_decodes_and_encodes_nothing(shards, tmp_path, monke
 
 
 @pytest.mark.parametrize("data", [{}, VIDEO])
-def test_a_damaged_shard_ends_training_with_its_name_unless_skipped(shards, tmp_path, data):
+def test_a_damaged_shard_ends_training_with_its_name(shards, tmp_path, data):
     damage(shards)
     with pytest.raises(DataError, match=r"shard .*shard-00001\.tar is damaged"):
         fit(tiny_recipe(shards, data=data), tmp_path / "ends")
-    with pytest.warns(UserWarning, match=r"damaged clips are replaced.*shard-00001\.tar"):
-        run = fit(tiny_recipe(shards, data={**data, "skip_damaged": True}), tmp_path / "skips")
-    assert read_metadata(RunFolder(run).weights)["step"] == 16
 
 
-def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
-    shards, tmp_path, monkeypatch
-):
+def test_skip_damaged_is_told_to_be_gone(shards):
+    with pytest.warns(RenamedWarning, match=r"data\.skip_damaged is gone: a damaged shard stops"):
+        recipe = tiny_recipe(shards, data={"skip_damaged": True})
+    assert recipe == tiny_recipe(shards, data={"skip_damaged": False})
+
+
+def test_a_run_that_damage_ended_goes_on_when_it_is_mended(shards, tmp_path, monkeypatch):
     recipe = {"trainer": {"callbacks": [{"class_path": "tests.training.tiny.Kill"}]}}
     whole = RunFolder(fit(tiny_recipe(shards, data=VIDEO, **recipe), tmp_path / "whole"))
     run = tmp_path / "run"
@@ -85,11 +87,6 @@ def test_a_run_that_damage_ended_goes_on_when_it_is_mended_or_skipped(
     damage(shards)
     with pytest.raises(DataError, match=r"shard-00001\.tar is damaged"):
         fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
-    skipped = shutil.copytree(run, tmp_path / "skipped")
-    skipping = tiny_recipe(shards, data={**VIDEO, "skip_damaged": True}, **recipe)
-    with pytest.warns(UserWarning, match="damaged clips are replaced"):
-        fit(skipping, "", resume=skipped)
-    assert read_metadata(RunFolder(skipped).weights)["step"] == 16
     shutil.copytree(sound, shards, dirs_exist_ok=True)
     fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
     assert_same(whole, RunFolder(run))

@@ -5,14 +5,19 @@ import pytest
 from acwm_core.data import remote
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
+from tests.data.serving import served
 from tests.training.test_fit import assert_same
 from tests.training.tiny import tiny_recipe
 
 
 def test_a_run_on_a_url_is_the_run_on_the_folder(data, tmp_path, monkeypatch):
+    """Every file is asked for once."""
     monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
     whole = RunFolder(fit(tiny_recipe(data), tmp_path / "local"))
-    run = RunFolder(fit(tiny_recipe(f"file://{data}"), tmp_path / "remote"))
+    with served(data) as server:
+        run = RunFolder(fit(tiny_recipe(server.url), tmp_path / "remote"))
+    assert set(server.asked.values()) == {1}
+    assert {"/card.yaml", "/train/manifest.jsonl"} <= set(server.asked)
     assert_same(whole, run)
     shards = {path.name for path in (tmp_path / "cache").rglob("*.tar")}
     assert shards == {path.name for path in data.glob("train/*.tar")}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from acwm_core.data.clips import DataConfig
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit

@@ -12,10 +12,8 @@ import torch
 import yaml
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.manifest import Manifest
+from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.shards import open_shard
-from acwm_core.data.video import Limits, decode_planes
 from acwm_core.env.card import ActionSpec
 from acwm_core.evaluation.clip_results import read_rows
 from acwm_core.evaluation.results import Summary
@@ -135,7 +133,7 @@ def tar(folder, seed):
     for position in range(len(reader)):
         reader.about(position)
         reader.array(position, "actions.npy")
-    reader.episode(0, (64, 64))
+    reader.episode(0)
 
 
 def manifest(folder, seed):
@@ -157,13 +155,6 @@ def parquet(folder, seed):
     read_rows(place(folder, "x.parquet", damaged(whole, seed) if seed % 2 else footer))
 
 
-def video(folder, seed):
-    whole = open_shard(SHARD).read(0, "video.mkv")
-    head = damaged(whole[:2000], seed) + whole[2000:]
-    start = 20 * (seed % 3 == 0)
-    decode_planes(damaged(whole, seed) if seed % 2 else head, start, None, Limits(66, (64, 64)))
-
-
 def lerobot(folder, seed):
     kind = "video" if seed % 2 else "image"
     root = shutil.copytree(HERE.parent / "lerobot" / kind, folder / "root")
@@ -183,7 +174,7 @@ FORMATS = {
     for each, cases in (
         *((summary, 40), (curve, 40), (experiment, 40), (card, 25), (recipe, 25), (weights, 40)),
         *((checkpoint, 40), (checkpoint_folder, 25), (npy, 60), (tar, 30), (manifest, 40)),
-        *((parquet, 40), (video, 30), (lerobot, 40)),
+        *((parquet, 40), (lerobot, 40)),
     )
 }
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import StateEstimator

@@ -1,29 +1,108 @@
-"""Random access to the episodes of a split, and to clips of them."""
+"""A dataset: the manifest of each split, and random access to its episodes."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import os
 import tempfile
-from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.card import DatasetCard
-from acwm_core.data.clips import clip_lengths, common_length, list_windows, window_actions
-from acwm_core.data.manifest import Manifest
+from acwm_core.data.atomic import written_whole
+from acwm_core.data.card import MANIFEST, DatasetCard
 from acwm_core.data.remote import data_folder, fetch_shard, origin
-from acwm_core.data.shards import ShardReader, damaged_shard, open_shard
-from acwm_core.data.video import Limits, decode_into, decode_planes
+from acwm_core.data.shards import ShardReader, ShardRecord, open_shard
+from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError
+from acwm_core.untrusted import read_bytes
 
-if TYPE_CHECKING:  # reading episodes needs no torch
-    from torch import Tensor
+
+class Manifest:
+    """The records of one split's folder, by shard name.
+
+    Lines are appended as shards finish, so a killed command loses none; `finish` sorts them.
+
+    Args:
+        folder: the folder of the split.
+        episodes: number of episodes according to the card. Shards beyond it come from a killed
+            command that was adding them, and are left out. By default all are read.
+
+    Raises:
+        DataError: the file is not a manifest.
+    """
+
+    def __init__(self, folder: Path, episodes: int | None = None) -> None:
+        self.path = folder / MANIFEST
+        self.records: dict[str, ShardRecord] = {}
+        text = read_bytes(self.path) if self.path.exists() else b""
+        lines = text.decode("utf-8", errors="replace").split("\n")  # damaged bytes fail below
+        for line in lines[:-1]:
+            try:
+                record = ShardRecord.from_json(line)
+            except ValueError as error:
+                raise DataError(
+                    f"{self.path} is damaged ({error}): delete it and run the same command, which "
+                    "describes the finished shards again"
+                ) from error
+            if episodes is None or record.first < episodes:
+                self.records[record.shard] = record
+        self._torn = bool(lines[-1])  # its writer was killed, or is still writing
+
+    def add(self, record: ShardRecord) -> None:
+        """Record a finished shard; the line is on disk when this returns."""
+        if self._torn:
+            self.finish()
+        self.records[record.shard] = record
+        with self.path.open("a") as file:
+            file.write(record.to_json() + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def finish(self) -> None:
+        """Rewrite the file with its records in order, so equal datasets have equal manifests."""
+        with written_whole(self.path) as partial:
+            lines = "".join(f"{record.to_json()}\n" for record in self.ordered())
+            partial.write_text(lines, encoding="utf-8")
+        self._torn = False
+
+    def ordered(self) -> list[ShardRecord]:
+        """The records, sorted by shard number."""
+        return [self.records[name] for name in sorted(self.records)]
+
+    def has(self, name: str) -> bool:
+        """Whether shard `name` is recorded and its file exists with the recorded size."""
+        path = self.path.parent / name
+        record = self.records.get(name)
+        return record is not None and path.exists() and path.stat().st_size == record.size
+
+    def checksum(self) -> str:
+        """SHA-256 of all shards' checksums, in 64 hex digits; it identifies the split's content."""
+        digests = "\n".join(record.sha256 for record in self.ordered())
+        return hashlib.sha256(digests.encode()).hexdigest()
+
+
+def action_statistics(records: Sequence[ShardRecord]) -> dict[str, list[float]]:
+    """Mean, standard deviation, minimum and maximum of every action dimension."""
+
+    def stacked(name: str) -> NDArray[np.float64]:
+        return np.array([getattr(record.actions, name) for record in records], np.float64)
+
+    count = sum(record.actions.count for record in records)
+    mean = stacked("total").sum(0) / count
+    squares = stacked("squares").sum(0) / count
+    return {
+        "mean": mean.tolist(),
+        "std": np.sqrt(np.maximum(squares - mean**2, 0)).tolist(),
+        "min": stacked("low").min(0).tolist(),
+        "max": stacked("high").max(0).tolist(),
+    }
 
 
 class EpisodeDataset:
@@ -77,17 +156,15 @@ class EpisodeDataset:
             DataError: its shard is missing or damaged.
         """
         reader, position = self._locate(index)
-        return reader.episode(position, self.card.environment.frame_size)
+        return reader.episode(position)
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[index] for index in range(len(self)))
 
     def video(self, index: int, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
-        limits = Limits(self.lengths[index], self.card.environment.frame_size)
         reader, position = self._locate(index)
-        with reader.decoding(position, "video.mkv") as data:
-            return decode_planes(data, start, stop, limits)
+        return reader.decoded(position, "video.mkv", lambda data: decode_planes(data, start, stop))
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
         """Decode frames of an episode, from frame `start` on, into `target` ``[T, 3, H, W]`` uint8.
@@ -95,21 +172,13 @@ class EpisodeDataset:
         After the end of the episode its last frame is repeated.
         """
         reader, position = self._locate(index)
-        with reader.decoding(position, "video.mkv") as data:
-            window_into(target, data, start, self.lengths[index])
+        length = self.lengths[index]
+        reader.decoded(position, "video.mkv", lambda data: window_into(target, data, start, length))
 
     def actions(self, index: int) -> NDArray[np.float32]:
         """The raw actions of an episode, ``[T, A]``."""
-        return self.actions_in(*self._locate(index), self.lengths[index])
-
-    def actions_in(self, reader: ShardReader, position: int, length: int) -> NDArray[np.float32]:
-        """The raw actions ``[length, A]`` of the episode at `position` in a shard."""
-        actions = cast(NDArray[np.float32], reader.array(position, "actions.npy"))
-        wanted = (length, self.card.environment.action.size)
-        if actions.shape != wanted:
-            reason = f"actions.npy of episode {position} are {actions.shape}, not {wanted}"
-            raise damaged_shard(reader.path, reason)
-        return actions
+        reader, position = self._locate(index)
+        return reader.array(position, "actions.npy")
 
     def about(self, index: int) -> dict[str, Any]:
         """Spec, factors, ood_label and versions of an episode, without decoding its video."""
@@ -149,7 +218,7 @@ class EpisodeDataset:
     def _fetched(self, number: int, path: Path) -> Path:
         if self._origin and not path.exists():
             record = self._records[number]
-            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record)
+            fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record.sha256)
         return path
 
 
@@ -162,82 +231,5 @@ def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int)
         DataError: the bytes are not such a video.
     """
     held = min(len(target), length - start)
-    decode_into(target[:held], data, start, Limits(length))
+    decode_into(target[:held], data, start)
     target[held:] = target[held - 1]
-
-
-class Clips(ABC):
-    """The windows of a split's episodes as a map-style dataset of clips.
-
-    Args:
-        episodes: where the clips come from.
-        frames: frames of a clip, T; a shorter episode gives one clip.
-        stride: frames between the starts of an episode's clips.
-        indices: only these episodes, e.g. those of `hold_out`; all by default.
-        temporal_stride: temporal stride of the codec. Clips of shorter episodes are then cut to
-            whole latent frames; by default they repeat their last frame with zero actions.
-        given: context frames of a clip; every clip has at least one latent frame more to predict.
-        per_length: how many clips should share a length, as those of a batch do; see
-            `shared_lengths`.
-
-    Attributes:
-        windows: rows ``(episode, first frame)``, one per clip.
-        lengths: number of video frames of each clip; see `clip_lengths` and `shared_lengths`.
-    """
-
-    def __init__(
-        self,
-        episodes: EpisodeDataset,
-        *,
-        frames: int = 37,
-        stride: int = 4,
-        indices: Sequence[int] | None = None,
-        temporal_stride: int | None = None,
-        given: int = 1,
-        per_length: int = 1,
-    ) -> None:
-        self.episodes, self.frames, self.stride = episodes, frames, stride
-        self.windows = list_windows(episodes.lengths, frames, stride, indices)
-        self.lengths = clip_lengths(
-            self.windows, episodes.lengths, frames, temporal_stride, given, per_length
-        )
-        self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """One clip: the arrays of `batch` without the batch axis."""
-        return {name: values[0] for name, values in self.batch([index]).items()}
-
-    @abstractmethod
-    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """Read clips of one length as a batch, which is faster than one by one.
-
-        Raises:
-            DataError: a shard is missing or damaged.
-        """
-
-
-class ClipDataset(Clips):
-    """Clips as video."""
-
-    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """`video` uint8 ``[B, T, 3, H, W]``, `actions` float32 ``[B, T, A]``, last rows zero."""
-        import torch
-
-        frames, card = common_length(self.lengths, indices), self.episodes.card.environment
-        video = np.empty((len(indices), frames, 3, *card.frame_size), np.uint8)
-        actions = np.empty((len(indices), frames, card.action.size), np.float32)
-        windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
-        for row, (episode, start) in enumerate(windows):
-            self.episodes.video_into(video[row], episode, start)
-            actions[row] = window_actions(self._actions_of(episode), start, frames)
-        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
-
-    def _actions_of(self, episode: int) -> NDArray[np.float32]:
-        if episode not in self._actions:
-            if len(self._actions) == 2**14:  # a limit for memory; actions are small
-                self._actions.clear()
-            self._actions[episode] = self.episodes.actions(episode)
-        return self._actions[episode]

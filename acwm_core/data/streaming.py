@@ -1,0 +1,128 @@
+"""`ClipStream`: clips from streamed shards, for datasets larger than the disk.
+
+It is a webdataset pipeline. Each worker of each rank has its own shards, in a new order in every
+pass, and draws the next clip from a buffer of compressed episodes. Of a dataset behind a URL, the
+disk holds one shard per worker. The stream has no position, so it cannot be resumed exactly.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils import data as torch_data
+
+from acwm_core.data.clips import ClipDataset, window_actions
+from acwm_core.data.dataset import window_into
+from acwm_core.data.loader import ClipSampler
+from acwm_core.data.shards import damaged_shard
+from acwm_core.errors import DataError
+
+default_collate = cast(Any, torch_data).default_collate  # it has no types
+
+
+class _Window(NamedTuple):
+    """A clip that is not decoded yet; windows of one episode share its bytes."""
+
+    video: bytes
+    actions: NDArray[np.float32]
+    start: int
+    frames: int
+    length: int  # frames of the episode
+    where: tuple[Path, int]  # the shard, and the episode's position in it
+
+
+class ClipStream(torch_data.IterableDataset[Any]):
+    """Batches of clips without end, on every rank, for a `ClipLoader`.
+
+    Args:
+        clips: which clips; only their shards are read, each when its turn comes.
+        sampler: its `batch_size`, `seed`, `rank` and `world_size` count, not its order.
+        shuffle_buffer: size of each worker's buffer, in clips, from which the next one is drawn.
+        workers: the loader's; 0 reads in its process.
+
+    Raises:
+        DataError: there are fewer shards than processes to read them.
+    """
+
+    def __init__(
+        self,
+        clips: ClipDataset,
+        sampler: ClipSampler,
+        *,
+        shuffle_buffer: int = 2000,
+        workers: int = 0,
+    ) -> None:
+        self.clips, self.sampler, self.shuffle_buffer = clips, sampler, shuffle_buffer
+        episodes: list[int] = clips.windows[:, 0].tolist()
+        self._shard_of = np.array([clips.episodes.shard_of(each) for each in episodes])
+        self._shards: list[int] = np.unique(self._shard_of).tolist()
+        self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clip length
+        shards, readers = len(self._shards), sampler.world_size * max(1, workers)
+        if shards < readers:
+            raise DataError(
+                f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
+                f"not {shards} in all: set fewer data.workers, or data.reader=random_access"
+            )
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield batches; a `DataError` is the last item, as in `ClipLoader`."""
+        import webdataset  # pyright: ignore[reportMissingTypeStubs]
+
+        wds, everything = cast(Any, webdataset), len(self._shards)
+        seed, own = self.sampler.seed, self._shards[self.sampler.rank :: self.sampler.world_size]
+        pipeline = wds.DataPipeline(
+            wds.SimpleShardList([str(number) for number in own]),
+            wds.split_by_worker,
+            wds.detshuffle(everything, initial=everything, seed=seed),
+            self._windows,
+            wds.detshuffle(self.shuffle_buffer, initial=self.shuffle_buffer, seed=seed),
+            self._batches,
+        ).repeat()
+        try:
+            yield from pipeline
+        except DataError as error:
+            yield error
+
+    def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
+        clips, episodes = self.clips, self.clips.episodes
+        owners: list[int] = clips.windows[:, 0].tolist()
+        for shard in shards:
+            number = int(shard["url"])
+            rows = np.flatnonzero(self._shard_of == number)
+            with episodes.passing_shard(number) as reader:
+                for episode, group in itertools.groupby(rows, owners.__getitem__):
+                    place = episode - episodes.shards[number][0]
+                    length, where = episodes.lengths[episode], (reader.path, place)
+                    actions = reader.array(place, "actions.npy")
+                    video = reader.read(place, "video.mkv")
+                    for row in group:
+                        start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
+                        yield _Window(video, actions, start, frames, length, where)
+
+    def _batches(self, windows: Iterable[_Window]) -> Iterator[dict[str, Tensor]]:
+        """Batches of clips of one length; clips that do not fill a batch wait for the next pass."""
+        for window in windows:
+            pending = self._pending[window.frames]
+            pending.append(self._decoded(window))
+            if len(pending) == self.sampler.batch_size:
+                yield default_collate(pending)
+                pending.clear()
+
+    def _decoded(self, window: _Window) -> dict[str, Tensor]:
+        size = self.clips.episodes.card.environment.frame_size
+        video = np.empty((window.frames, 3, *size), np.uint8)
+        path, place = window.where
+        try:
+            window_into(video, window.video, window.start, window.length)
+        except DataError as error:
+            raise damaged_shard(path, f"video.mkv of episode {place}: {error}") from error
+        actions = window_actions(window.actions, window.start, window.frames)
+        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
