@@ -16,7 +16,7 @@ from torch.distributed import DistBackendError
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.env.environment import resolve_size
 from acwm_core.errors import AcwmError, TrainingError
