@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
+from acwm_core.checks.result import NotTried, Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import moving_discs
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
@@ -67,8 +67,8 @@ class CodecChecks(Suite):
         """Decode latent frames one by one to the same video as together, or refuse to."""
         try:
             decode = self._codec.frame_decoder()
-        except RecipeError:
-            return
+        except RecipeError as error:
+            raise NotTried(str(error)) from None
         latents = self._codec.encode(self._clip(batch=2))
         single = torch.cat([decode(latents[:, i : i + 1]) for i in range(latents.shape[1])], 1)
         together = self._codec.decode(latents)

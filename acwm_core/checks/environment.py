@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from acwm_core.checks.result import expect, expect_equal, expect_is_a
+from acwm_core.checks.result import NotTried, expect, expect_equal, expect_is_a
 from acwm_core.checks.task import TaskChecks
 from acwm_core.checks.trial import BEGINNING
 from acwm_core.data.simulate import digests_elsewhere, simulate
@@ -155,7 +155,7 @@ class EnvironmentChecks(TaskChecks):
     def perturbed_start_is_close(self) -> None:
         """Start close to the usual start, and at rest, when asked for a perturbed start."""
         if not self.environment.can_be_perturbed:
-            return
+            raise NotTried("its start cannot be perturbed")
         still, spec = np.tile(self._still_action(), (6, 1)), self.spec()
         usual, same, moved, again = (
             simulate(self.environment, spec, still, frames=len(still), perturbation=amount)
@@ -230,7 +230,7 @@ class EnvironmentChecks(TaskChecks):
         usual = self.beginning
         self._started(self.spec())
         if self.environment.snapshot() is None:
-            return
+            raise NotTried("it takes no snapshots")
         middle = len(usual.actions) // 2
         for action in usual.actions[:middle]:
             self.environment.step(action)

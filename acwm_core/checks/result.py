@@ -19,14 +19,18 @@ class CheckFailure(Exception):
     """A check did not pass; the message is one sentence that says why."""
 
 
+class NotTried(Exception):
+    """A check has nothing to try on this component; the message says why."""
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """The result of one check.
 
     Attributes:
         name: the check in words, e.g. ``"same spec same bytes"``.
-        passed: whether the component conforms.
-        reason: one sentence if it does not; else empty.
+        passed: whether the component conforms, or there was nothing to try.
+        reason: why it does not, or why there was nothing to try; else empty.
     """
 
     name: str
@@ -35,7 +39,11 @@ class CheckResult:
 
     def __str__(self) -> str:
         """One line, for a terminal or a test's message."""
-        return f"ok    {self.name}" if self.passed else f"FAIL  {self.name}: {self.reason}"
+        if not self.passed:
+            return f"FAIL  {self.name}: {self.reason}"
+        return (
+            f"--    {self.name}: not tried: {self.reason}" if self.reason else f"ok    {self.name}"
+        )
 
 
 def expect(condition: object, reason: str) -> None:
@@ -69,8 +77,8 @@ def run_checks(suite: Suite) -> Iterator[CheckResult]:
         try:
             with noting(f"in {suite.target.__name__}", suite.target):
                 check(suite)
-        except CheckFailure as error:
-            yield CheckResult(name, False, str(error))
+        except (CheckFailure, NotTried) as result:
+            yield CheckResult(name, isinstance(result, NotTried), str(result))
         except (Exception, SystemExit) as error:
             yield CheckResult(name, False, sentence(error))
             if index == 0:

@@ -7,7 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from acwm_core.checks.result import CheckResult, expect, expect_equal, expect_is_a, run_checks
+from acwm_core.checks.result import (
+    CheckResult,
+    NotTried,
+    expect,
+    expect_equal,
+    expect_is_a,
+    run_checks,
+)
 from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.env.task import Task, TaskEnvironment, observed
 from acwm_core.plugins import catalog
@@ -36,11 +43,13 @@ class TaskChecks(EnvironmentTrial):
 
     @functools.cached_property
     def tasks(self) -> dict[str, TaskEnvironment]:
-        """The tasks by name; empty if the environment was given as a class."""
+        """The tasks by name; those of a class are not known."""
         if self.name is None:
-            return {}
+            raise NotTried("a class has no tasks: give its registered name")
         found = catalog().component("environment", self.name)
         names = [name for name in found.tasks if self.only in (None, name)]
+        if not names:
+            raise NotTried("it has no tasks")
         tasks = {name: found.load_task(name) for name in names}
         for name, task in tasks.items():
             expect_is_a(task, Task)
@@ -74,13 +83,19 @@ class TaskChecks(EnvironmentTrial):
 
     def solutions_approach_goals(self) -> None:
         """Get closer to the goal with the scripted solution, if a task provides one."""
+        solutions = 0
         for name, env in self.tasks.items():
             _, info = env.reset(options={"spec": self.spec()})
             start = info["distance"]
             act = env.task.solution(env.environment, env.goal, self.spec().rng("solution"))
-            for _ in range(env.task.max_steps if act else 0):
-                _, _, success, _, info = env.step(np.asarray(act and act(), np.float32))
+            if act is None:
+                continue
+            solutions += 1
+            for _ in range(env.task.max_steps):
+                _, _, success, _, info = env.step(np.asarray(act(), np.float32))
                 if success:
                     break
             what = f"the solution of {name!r} leads from {start:.3g} to {info['distance']:.3g}"
-            expect(act is None or info["distance"] < start, what)
+            expect(info["distance"] < start, what)
+        if not solutions:
+            raise NotTried("no task has a scripted solution")

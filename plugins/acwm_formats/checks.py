@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from acwm_core.checks.result import Suite, expect, expect_is_a
+from acwm_core.checks.result import NotTried, Suite, expect, expect_is_a
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.formats import DatasetExporter, DatasetImporter, export_dataset, options_of
@@ -89,7 +89,7 @@ class DatasetExporterChecks(FormatChecks):
         """Write files that the importer of the same name, if any, reads as the same episodes."""
         importers = {each.name: each for each in catalog().registry("dataset_importer")}
         if self.name not in importers:
-            return
+            raise NotTried("no importer has its name")
         found = _datasets(importers[self.name].load()(self._folder / "one"))
         expect(len(found) == 1, f"it reads {len(found)} datasets")
         back = _imported(next(iter(found.values())), self._folder / "back")

@@ -7,6 +7,7 @@ from acwm_core.checks.disc import Disc
 from acwm_core.checks.environment import EnvironmentChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.checks.task import TaskChecks
+from acwm_core.env.environment import Environment
 from acwm_core.errors import UnknownNameError
 from tests.checks.flawed import FLAWS
 from tests.checks.results import failures, in_words, installed
@@ -38,6 +39,23 @@ def test_flaws_are_found(flawed, monkeypatch):
 def test_every_check_has_a_flaw_that_it_finds():
     of_tasks = {in_words(check) for check in checks_of(TaskChecks)}  # tests/tasks has theirs
     assert FLAWS.checks() == {in_words(check) for check in CHECKS} - of_tasks
+
+
+def test_what_cannot_be_tried_is_told():
+    class Bare(Disc):
+        _perturb = Environment._perturb
+        _snapshot = Environment._snapshot
+
+    found = {result.name: str(result) for result in check_environment(Bare)}
+    untried = {name: line for name, line in found.items() if "not tried" in line}
+    assert untried["perturbed start is close"].startswith(
+        "--    perturbed start is close: not tried:"
+    )
+    assert "it takes no snapshots" in untried["snapshot returns to its moment"]
+    assert untried.keys() - {in_words(check) for check in checks_of(TaskChecks)} == {
+        "perturbed start is close",
+        "snapshot returns to its moment",
+    }
 
 
 def test_unknown_environments_are_named_at_once():
