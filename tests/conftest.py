@@ -36,8 +36,12 @@ DEAREST = (
 """Where tests take long; these come first, so that processes side by side end at about one time."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers
 def pytest_collection_modifyitems(items):
-    """Files stay in one piece, and their tests in order."""
+    """Files stay in one piece, and their tests in order; those that use a browser are marked."""
+    for item in items:
+        if "browser" in item.fixturenames:
+            item.add_marker("browser")
     items.sort(key=lambda item: not item.nodeid.startswith(DEAREST))
 
 

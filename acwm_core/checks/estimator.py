@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from acwm_core.checks.result import Checked, Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import EnvironmentTrial
+from acwm_core.data.simulate import simulate
+from acwm_core.env.episode import Episode
 from acwm_core.env.physics import Observation, Physics, StateEstimator
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.shapes import Clip
@@ -47,18 +49,23 @@ class EstimatorChecks(Suite):
         return self.make(card=self._environment.card)
 
     @functools.cached_property
+    def _episode(self) -> Episode:
+        trial = self._environment
+        return simulate(trial.environment, trial.spec(), frames=FRAMES)
+
+    @functools.cached_property
     def _video(self) -> Clip:
-        return as_clip(self._environment.episode.video[:FRAMES])
+        return as_clip(self._episode.video)
 
     @functools.cached_property
     def _observation(self) -> Observation:
         return self._estimator.estimate(self._video)
 
     def _positions(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        states = self._environment.episode.states
+        states = self._episode.states
         for reading in self._estimator.physics.readings:
             if reading.kind == "position":
-                yield reading.field, np.asarray(states[reading.field][:FRAMES], np.float64)
+                yield reading.field, np.asarray(states[reading.field], np.float64)
 
     def reads_a_clip(self) -> None:
         """Construct the estimator from a card, and read masks and states of the right shapes."""
@@ -88,7 +95,7 @@ class EstimatorChecks(Suite):
 
     def tells_instances_apart(self) -> None:
         """Find the pixels of every instance that is large enough to be visible."""
-        masks = self._environment.episode.masks[:FRAMES]
+        masks = self._episode.masks
         for name in self._estimator.instances:
             instance = self._environment.card.instances.index(name)
             true, found = masks == instance, self._observation.masks == instance

@@ -1,10 +1,12 @@
 """Import Taichi and start it once per process, with helpful errors if something is missing."""
 
 import contextlib
+import functools
 import io
 import os
 import threading
 from multiprocessing.util import Finalize
+from typing import Any
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
@@ -12,7 +14,8 @@ from acwm_core.errors import AcwmError
 
 try:
     import taichi as ti
-    from taichi.lang import impl
+    from taichi.lang import impl, kernel_impl
+    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 except ImportError as error:
     if "libX11" in str(error):
         raise AcwmError(
@@ -22,6 +25,19 @@ except ImportError as error:
     raise
 
 __all__ = ["start", "ti"]
+
+# Taichi reads the source of a function at each of its calls, and draws each expression as text for
+# the case of an error: more than half of the time before the first frame. Neither ends in a kernel.
+kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
+
+
+def _position(self: Any, node: Any) -> str:
+    line, function = node.lineno + self.lineno_offset, self.func.func.__name__
+    return f'File "{self.file}", line {line}, in {function}:\n'
+
+
+ASTTransformerContext.get_pos_info = _position
 
 _started_in: int | None = None
 

@@ -1,23 +1,54 @@
 """Every installed environment conforms, and every check of environments can fail."""
 
+import functools
+import os
+from multiprocessing.util import Finalize
+
 import pytest
 
 from acwm_core.checks import check_environment
 from acwm_core.checks.disc import Disc
 from acwm_core.checks.environment import EnvironmentChecks
-from acwm_core.checks.result import checks_of
+from acwm_core.checks.result import checks_of, run_checks
 from acwm_core.checks.task import TaskChecks
+from acwm_core.data.shards import open_shard, write_shard
+from acwm_core.data.simulate import digests_elsewhere
+from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.errors import UnknownNameError
 from tests.checks.flawed import FLAWS
-from tests.checks.results import failures, in_words, installed
+from tests.checks.results import failures, in_words, with_variants_slow
+from tests.episodes import assert_same
 
 CHECKS = checks_of(EnvironmentChecks)
 
 
-@pytest.mark.parametrize("part", installed("environment"), ids=lambda part: part.name)
-def test_installed_environments_conform(part):
-    assert failures(check_environment(part.name)) == {}
+def with_two_threads(make):
+    """Make an environment in a process in which Taichi has two threads to use."""
+    import taichi
+
+    taichi.init(arch=taichi.cpu, cpu_max_num_threads=2, log_level=taichi.ERROR)
+    Finalize(None, taichi.reset, exitpriority=0)  # keeps what it compiled for the next time
+    assert os.environ["OMP_NUM_THREADS"] == "2"
+    return make()
+
+
+@pytest.mark.parametrize("part", with_variants_slow("environment"))
+def test_installed_environments_conform(part, monkeypatch, tmp_path):
+    """Also if its fresh process has two threads, and a shard gives back what was simulated."""
+    for library in ("OMP", "OPENBLAS"):
+        monkeypatch.setenv(f"{library}_NUM_THREADS", "2")
+    monkeypatch.setattr(
+        "acwm_core.checks.environment.digests_elsewhere",
+        lambda make, *which: digests_elsewhere(functools.partial(with_two_threads, make), *which),
+    )
+    suite = EnvironmentChecks(part.name)
+    assert failures(run_checks(suite)) == {}
+
+    check_episode(suite.episode, suite.card)
+    write_shard(tmp_path / "shard-00000.tar", [suite.episode], suite.card.fps, {})
+    read = open_shard(tmp_path / "shard-00000.tar").episode(0)
+    assert_same(read, suite.episode)
 
 
 def test_a_sound_environment_passes_every_check():

@@ -11,7 +11,7 @@ from acwm_core.checks.estimator import EstimatorChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.env.physics import Observation, Physics, Reading, StateEstimator
 from acwm_core.errors import ShapeError
-from tests.checks.results import Flaws, failures, installed
+from tests.checks.results import Flaws, failures, with_variants_slow
 
 FLAWS = Flaws(check_estimator, checks_of(EstimatorChecks), Disc)
 
@@ -47,7 +47,7 @@ class DiscEstimator(StateEstimator):
         return np.asarray(values) * height + np.array([width, height]) / 2
 
 
-@pytest.mark.parametrize("part", installed("estimator"), ids=lambda part: part.name)
+@pytest.mark.parametrize("part", with_variants_slow("estimator"))
 def test_installed_estimators_conform(part):
     assert failures(check_estimator(part.name)) == {}
 

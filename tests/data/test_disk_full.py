@@ -22,6 +22,7 @@ def whole(tmp_path_factory):
     return checksums(folder)
 
 
+@pytest.mark.slow
 def test_disks_of_many_sizes(whole, tmp_path):
     if shutil.which("unshare") is None:
         pytest.skip("this system has no unshare")
@@ -77,5 +78,5 @@ if __name__ == "__main__":
     assert found.stdout.strip().endswith(SENTENCE)
     assert not list(out.rglob("*.tar"))
     assert not list(out.rglob("*.partial"))
-    run(out, "square")
+    run(out, "square", workers=0)
     assert checksums(out) == whole

@@ -31,7 +31,7 @@ def make(out, environment="square", **changes):
     return generate(environment, out, **(settings | changes))
 
 
-@pytest.mark.parametrize("workers", [1, 2, 8])
+@pytest.mark.parametrize("workers", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_any_number_of_workers_makes_the_same_bytes(square_data, tmp_path, workers):
     make(tmp_path / "again", workers=workers)
     assert checksums(tmp_path / "again") == checksums(square_data)

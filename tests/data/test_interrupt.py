@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "data"
-    run(folder)
+    run(folder, workers=0)
     return checksums(folder)
 
 
@@ -70,12 +70,13 @@ def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     for path in finished:
         assert checksums(out)[str(path)] == uninterrupted[str(path)]
 
-    run(out)
+    run(out, workers=0)
     assert checksums(out) == uninterrupted
     assert all((out / path).stat().st_ino == inode for path, inode in finished.items())
     assert not list(out.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
     """The same command, killed again and again wherever it happens to be, until it gets through."""
     out, rng = tmp_path / "data", random.Random(0)
@@ -109,5 +110,5 @@ def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted
     _, complaint = process.communicate(timeout=PATIENCE)
     assert process.returncode != 0
     assert "a worker process died, perhaps out of memory" in complaint
-    run(out)
+    run(out, workers=0)
     assert checksums(out) == uninterrupted

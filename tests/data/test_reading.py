@@ -24,7 +24,10 @@ def stream(data, count):
     return [known[clip] for clip in test_loader.stream(len(clips), 7, count)]
 
 
-@pytest.mark.parametrize(("ranks", "workers"), [(2, 2), (4, 0)])
+@pytest.mark.parametrize(
+    ("ranks", "workers"),
+    [(2, 0), *(pytest.param(*more, marks=pytest.mark.slow) for more in [(2, 2), (4, 0)])],
+)
 def test_ranks_take_equal_steps_whatever_the_shards(ranks, workers, square_data, tmp_path):
     """Three shards on 2 ranks × 2 workers, and more ranks than shards.
 
@@ -70,7 +73,7 @@ def assert_as_if_nothing_had_happened(runs, data):
         assert [int(clip) for _, clip in logged] == [truth[int(place)] for place, _ in logged]
 
 
-@pytest.mark.parametrize("kills", [30, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.slow)])
 def test_kills_change_nothing(kills, square_data, tmp_path):
     """Each reader has other ranks, another batch size or workers than the one before."""
     plans = [[1, 3, 0], [2, 2, 0], [1, 4, 2], [3, 1, 0], [1, 8, 0]]

@@ -7,12 +7,12 @@ import tarfile
 import numpy as np
 import pytest
 from forging import npy, zipped
-from test_simulate import assert_same
 
 from acwm_core.data.shards import MEMBERS, ShardRecord, from_npy, from_npz, open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
+from tests.episodes import assert_same
 
 VERSIONS = {"acwm": "1"}
 

@@ -25,6 +25,8 @@ for needed in ("mkdocs", "material", "mkdocstrings", "jupytext"):
 for simulator in ("mujoco", "pybullet", "taichi"):  # the page of environments is made from cards
     pytest.importorskip(simulator)
 
+pytestmark = pytest.mark.browser
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -162,10 +164,13 @@ CONTRAST = """() => {
     .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
   const parts = (text) => [...text.match(/[\\d.]+/g).map(Number), 1].slice(0, 4);
   const over = (top, below, share) => below.map((v, k) => v * (1 - share) + top[k] * share);
+  const known = new Map([[null, [255, 255, 255]]]);
   const ground = (each) => {
-    const own = parts(getComputedStyle(each).backgroundColor);
-    const below = each.parentElement ? ground(each.parentElement) : [255, 255, 255];
-    return over(own, below, own[3]);
+    if (!known.has(each)) {
+      const own = parts(getComputedStyle(each).backgroundColor);
+      known.set(each, over(own, ground(each.parentElement), own[3]));
+    }
+    return known.get(each);
   };
   const faint = [];
   for (const each of document.querySelectorAll("article *, .md-tabs *, .md-sidebar a")) {
@@ -200,8 +205,9 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("viewport", [DESK, PHONE], ids=["desk", "phone"])
+@pytest.mark.parametrize(
+    ("viewport", "scheme"), [(DESK, "light"), (PHONE, "dark")], ids=["desk", "phone"]
+)
 def test_pages_can_be_read_in_a_browser(browser, address, viewport, scheme):
     page = browser.new_page(viewport=viewport, color_scheme=scheme)
     complaints = []
