@@ -1,11 +1,10 @@
-"""Executors: map a function over tasks, here or elsewhere, or run commands in a batch system."""
+"""Executors: map a function over tasks, here or elsewhere."""
 
 from __future__ import annotations
 
 import contextlib
 import multiprocessing
 import os
-import shlex
 import signal
 import threading
 import time
@@ -13,17 +12,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.plugins import catalog
 from acwm_core.recipe.check import check_component
-from acwm_core.recipe.compose import merge, parse_override
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -101,81 +98,6 @@ class Executor(ABC):
         """
 
 
-JobKind = Literal["simulate", "train", "evaluate", "plan", "report"]
-"""What a job does; batch options may differ by kind."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """An `acwm` command for a batch system.
-
-    Attributes:
-        name: name of the job and of its log.
-        kind: simulations of the same name run one at a time. A report starts even if jobs that it
-            needs fail. A training gets SIGUSR1 some minutes before its time limit, and may requeue
-            itself.
-        command: the words after ``acwm``.
-        needs: names of jobs that must succeed first; those not submitted count as succeeded.
-        nodes: number of machines.
-        tasks: processes per machine.
-        gpus: GPUs per machine.
-    """
-
-    name: str
-    kind: JobKind
-    command: tuple[str, ...]
-    needs: tuple[str, ...] = ()
-    nodes: int = 1
-    tasks: int = 1
-    gpus: int = 0
-
-    @property
-    def shown(self) -> str:
-        """The command as typed in a shell, after a prompt."""
-        return f"$ {shlex.join(('acwm', *self.command))}"
-
-
-class JobState(NamedTuple):
-    """The id of a job, and whether it is queued, is running, failed or ended."""
-
-    id: str
-    state: Literal["queued", "running", "failed", "ended"]
-
-
-class BatchExecutor(Executor):
-    """An executor that also queues commands, which wait for each other and outlive this process.
-
-    It records in its folder what was submitted.
-    """
-
-    @abstractmethod
-    def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
-        """Queue those of `jobs` that are not in the queue, each to start after the jobs it needs.
-
-        If a job is queued again, queued jobs that need it are queued again as well.
-
-        Args:
-            jobs: sorted so that each comes after the jobs it needs.
-            program: the words that run ``acwm``.
-            logs: folder of the files ``NAME.log``; the time, `Job.shown` and the job's output are
-                appended to them.
-
-        Returns:
-            The ids of the new jobs, by name.
-
-        Raises:
-            DataError: a job is refused; those before it stay in the queue.
-        """
-
-    @abstractmethod
-    def states(self) -> Mapping[str, JobState]:
-        """The state of the last job of each name that was submitted from this folder.
-
-        Raises:
-            DataError: the batch system does not answer.
-        """
-
-
 def create_executor(
     name: str, folder: Path, workers: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Executor:
@@ -198,24 +120,6 @@ def create_executor(
     checked = check_component("executor", {"name": name, "folder": str(folder), **given})
     chosen = {"folder": folder, "workers": workers, **{option: checked[option] for option in given}}
     return catalog().component("executor", name).create(**chosen)
-
-
-def split_options(
-    overrides: Sequence[str], section: str = "executor"
-) -> tuple[list[str], dict[str, Any]]:
-    """Split overrides into all others, and the options that ``executor.NAME=VALUE`` sets.
-
-    Args:
-        section: the section to split off, instead of ``executor``.
-
-    Raises:
-        RecipeError: a value is not YAML.
-    """
-    own = [override for override in overrides if override.startswith(f"{section}.")]
-    options: dict[str, Any] = {}
-    for override in own:
-        options = merge(options, parse_override(override)[section])
-    return [override for override in overrides if override not in own], options
 
 
 class LocalExecutor(Executor):

@@ -137,6 +137,26 @@ def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:
     return click.option(old, hidden=True, callback=warn, help=f"Now {new}.", **settings)
 
 
+def split_options(
+    overrides: Sequence[str], section: str = "executor"
+) -> tuple[list[str], dict[str, Any]]:
+    """Split overrides into all others, and the options that ``executor.NAME=VALUE`` sets.
+
+    Args:
+        section: the section to split off, instead of ``executor``.
+
+    Raises:
+        RecipeError: a value is not YAML.
+    """
+    from acwm_core.recipe.compose import merge, parse_override
+
+    own = [override for override in overrides if override.startswith(f"{section}.")]
+    options: dict[str, Any] = {}
+    for override in own:
+        options = merge(options, parse_override(override)[section])
+    return [override for override in overrides if override not in own], options
+
+
 def split_parameters(
     section: str, name: str, overrides: Sequence[str]
 ) -> tuple[list[str], dict[str, Any]]:
@@ -145,7 +165,6 @@ def split_parameters(
     Returns:
         The other overrides, and the checked parameters.
     """
-    from acwm_core.executors import split_options
     from acwm_core.recipe.check import check_component, check_metric_params
 
     others, given = split_options(overrides, section)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.arguments import OUT_FOLDER, renamed_option, size
+from acwm_core.cli.arguments import OUT_FOLDER, renamed_option, size, split_options
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def generate(
     from acwm_core.data.generate import generate as generate_dataset
     from acwm_core.data.generate import parse_episodes
     from acwm_core.data.simulate import make_environment
-    from acwm_core.executors import create_executor, split_options
+    from acwm_core.executors import create_executor
     from acwm_core.plugins import catalog
 
     out = out or Path("data", environment)
@@ -88,8 +88,6 @@ def generate(
 
 def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:
     """Parse ``factors.NAME=SETTING``; that the environment has these factors is checked later."""
-    from acwm_core.executors import split_options
-
     wrong, factors = split_options(overrides, "factors")
     values = factors.items()
     wrong += [f"factors.{name}={v}" for name, v in values if type(v) not in (int, float, str)]

@@ -15,7 +15,8 @@ import submitit
 from submitit.core.utils import FailedJobError, FailedSubmissionError
 
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.executors import BatchExecutor, Job, JobKind, JobState, Report, Result, Task
+from acwm_core.executors import Report, Result, Task
+from acwm_executors.batch import BatchExecutor, Job, JobKind, JobState
 
 ATTEMPTS = 3
 """Most arrays that are submitted; the later ones run tasks that earlier ones did not finish."""

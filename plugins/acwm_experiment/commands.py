@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.arguments import FOLDER, renamed_option, seed_numbers
+from acwm_core.cli.arguments import FOLDER, renamed_option, seed_numbers, split_options
 from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
 
@@ -74,7 +74,6 @@ def experiment(
     If it is interrupted, run the same command again to continue. A failed run does not stop the
     others; the exit code is then 1. --plan changes nothing and works at any time.
     """
-    from acwm_core.executors import split_options
     from acwm_experiment.files import read_experiment
     from acwm_experiment.grid import read_grid
     from acwm_experiment.plan import make_plan

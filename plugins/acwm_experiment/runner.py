@@ -8,7 +8,8 @@ from pathlib import Path
 
 from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
-from acwm_core.executors import BatchExecutor, JobState, available_cores, create_executor
+from acwm_core.executors import available_cores, create_executor
+from acwm_executors.batch import BatchExecutor, JobState
 from acwm_experiment.local import LocalRunner
 from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.steps import Step, all_progress, all_steps, step_progress

@@ -12,11 +12,11 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
-from acwm_core.executors import Job
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
 from acwm_core.untrusted import parse_json, read_bytes
+from acwm_executors.batch import Job
 from acwm_experiment.files import slug
 from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.runs import DatasetSpec, RunSpec

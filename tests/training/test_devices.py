@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from acwm_core.cli.memory import state_memory
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.fit import fit
+from acwm_core.training.memory import state_memory
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.training.test_fit import numbers
 from tests.training.tiny import tiny_recipe

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from acwm_core.cli.memory import state_memory
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
+from acwm_core.training.memory import state_memory
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
 COMMANDS = re.findall(r"(?:acwm|acwm_core\.cli) fit ([^;`\n]+)", TEXT.replace("\\\n", " "))
