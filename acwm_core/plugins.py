@@ -35,6 +35,10 @@ KINDS = {
     "codec": ("acwm_core.model.codec:Codec", "video to latents and back"),
     "model": ("acwm_core.model.dynamics:DynamicsModel", "predicts latents"),
     "conditioner": ("acwm_core.model.conditioner:Conditioner", "brings actions into a model"),
+    "objective": (
+        "acwm_core.model.objectives.objective:Objective",
+        "how a model learns, and how it predicts",
+    ),
     "metric": ("acwm_core.evaluation.metric:Metric", "scores predicted video"),
     "estimator": (
         "acwm_core.env.physics:StateEstimator",
@@ -51,8 +55,45 @@ KINDS = {
 }
 """Core's kinds of component: what a target is, and in a phrase. Plugins add kinds of their own."""
 
-CHECKED = ("environment", "codec", "model", "conditioner", "metric", "estimator", "task")
+CHECKED = [
+    "environment",
+    "codec",
+    "model",
+    "conditioner",
+    "objective",
+    "metric",
+    "estimator",
+    "task",
+]
 """Those of them with a conformance suite ``acwm_core.checks.check_KIND``."""
+
+OWN = {
+    "objective": {
+        "full_sequence": (
+            "model.objectives.full_sequence:FullSequence",
+            "flow matching with one noise level per clip, as in the paper; no streams",
+        ),
+        "diffusion_forcing": (
+            "model.objectives.diffusion_forcing:DiffusionForcing",
+            "flow matching with one noise level per latent frame; for causal models",
+        ),
+        "next_frame": (
+            "model.objectives.next_frame:NextFrame",
+            "flow matching of each latent frame after a clean past; for causal models",
+        ),
+        "regression": (
+            "model.objectives.regression:Regression",
+            "squared error of a prediction at once; for models that do not denoise",
+        ),
+    },
+    "executor": {
+        "processes": (
+            "executors:LocalExecutor",
+            "processes of this machine; --workers 0 for none",
+        ),
+    },
+}
+"""Core's own components by kind and name: target and summary."""
 
 REMOVED_HOOKS = {
     "register_checks": "give the suite to the kind: `registry.add(…, check='module:suite')` in "
@@ -82,6 +123,7 @@ class Component:
             `acwm_core.env.physics.Physics`; the module imports no simulator.
         tasks: for an environment, ``"package.module:TASK"`` of its tasks by name, see
             `acwm_core.env.task.Task`; the modules import no simulator.
+        objective: for a model, the objective that it learns by if none was chosen along with it.
     """
 
     kind: str
@@ -95,6 +137,7 @@ class Component:
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
     physics: str | None = None
     tasks: Mapping[str, str] = field(default_factory=dict[str, str])
+    objective: str | None = None
 
     @property
     def part(self) -> str:
@@ -200,6 +243,7 @@ class Registry:
         requires: tuple[str, ...] = (),
         physics: str | None = None,
         tasks: Mapping[str, str] | None = None,
+        objective: str | None = None,
         **defaults: Any,
     ) -> None:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
@@ -212,6 +256,7 @@ class Registry:
             requires: the modules that this extra installs, e.g. ``("mujoco",)``.
             physics: for an environment, the target of its physics, for estimators.
             tasks: for an environment, the targets of its tasks, by name.
+            objective: for a model, the objective that it learns by, if it has one of its own.
             **defaults: parameters that this name presets.
 
         Raises:
@@ -227,7 +272,9 @@ class Registry:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
         about = self._plugin, self._distribution, summary, extra, requires, defaults, physics
-        self._components[name] = Component(self.kind, name, target, *about, dict(tasks or {}))
+        self._components[name] = Component(
+            self.kind, name, target, *about, dict(tasks or {}), objective
+        )
 
     def include(self, component: Component) -> None:
         """Add a component that is known from elsewhere, unless its name is taken."""
@@ -304,11 +351,9 @@ class Catalog:
             check = f"acwm_core.checks:check_{kind}" if kind in CHECKED else ""
             self.registry("kind").add(kind, target, summary=summary, check=check)
             self._open(kind)
-        self.registry("executor").add(
-            "processes",
-            "acwm_core.executors:LocalExecutor",
-            summary="processes of this machine; --workers 0 for none",
-        )
+        for kind, components in OWN.items():
+            for name, (target, summary) in components.items():
+                self.registry(kind).add(name, f"acwm_core.{target}", summary=summary)
 
     def _open(
         self, kind: str, plugin: str = "acwm_core", distribution: str | None = "acwm"

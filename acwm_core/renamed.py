@@ -59,7 +59,7 @@ RENAMED = {
         "data.encoding": "data.latents",
         "data.episodes": "data.dataset",
         "data.manifest": "data.dataset",
-        "denoiser": "model.denoiser",
+        "denoiser": "model.dynamics",
         "dynamics": "model.dynamics",
         "environment": "env.environment",
         "environment_card": "env.card",

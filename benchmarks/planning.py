@@ -29,6 +29,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import TaskEnvironment
 from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_planning.futures import History, ModelRollouts
@@ -55,7 +56,7 @@ def random_world(card: Any) -> WorldModel:
         heads=network.heads,
     )
     bounds = card.action.low, card.action.high
-    world = WorldModel(codec, shaken(network), shaken(conditioner), *bounds)
+    world = WorldModel(codec, shaken(network), shaken(conditioner), Regression(), *bounds)
     return world.requires_grad_(False).eval()
 
 
@@ -88,7 +89,7 @@ def measure(
     assert estimator is not None
     world.codec.encode = clock.timed("encode", world.codec.encode)
     world.codec.decode = clock.timed("decode", world.codec.decode)
-    world.model.predict = clock.timed("predict", world.model.predict)
+    world.objective.predict = clock.timed("predict", world.objective.predict)
     estimator.estimate = clock.timed("estimate", estimator.estimate)
     settings = settings_of([f"planner={planner}", f"planner.horizon={horizon}", f"cost={cost}"])
     searching, judge = make_planner(settings), make_cost(settings)

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.checks.trial import shaken
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.world_model import CLIP_FRAMES, WorldModel
 from acwm_core.plugins import catalog
 
@@ -65,11 +65,9 @@ def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
     if not decoding:
         grey = torch.full((1, codec.temporal_stride, 3, setting.size, setting.size), 0.5)
         codec.frame_decoder = lambda: lambda latents: grey
-    network.flow = Flow(
-        objective="diffusion_forcing", prediction="clean", shift=20, steps=setting.steps
-    )
+    objective = DiffusionForcing(prediction="clean", shift=20, steps=setting.steps)
     bounds = [-1.0] * ACTION_SIZE, [1.0] * ACTION_SIZE
-    world = WorldModel(codec, shaken(network), shaken(conditioner), *bounds)
+    world = WorldModel(codec, shaken(network), shaken(conditioner), objective, *bounds)
     return world.requires_grad_(False).eval()
 
 
@@ -96,7 +94,7 @@ class Uncached:
             return world.model(torch.cat([past, noisy], 1), levels, conditioning)[:, -1:]
 
         noise = torch.randn(past.shape[2:], generator=self.generator)[None, None]
-        new = world.model.flow.sample(denoise, noise, noise[:, :0])
+        new = world.objective.sample(denoise, noise, noise[:, :0])
         self.latents = torch.cat([past, new], 1)
         return new
 

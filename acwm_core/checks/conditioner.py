@@ -10,7 +10,7 @@ from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
-from acwm_core.model.conditioner import Conditioner, Conditioning, takes_widths
+from acwm_core.model.conditioner import Conditioner, Conditioning
 
 FIT = {"action_size": 3, "temporal_stride": 4, "width": 16, "layers": 2, "heads": 2}
 """Sizes of the environment, codec and model for which conditioners are built here."""
@@ -94,7 +94,6 @@ class ConditionerChecks(Suite):
         """With an `inject`, take `widths` and keep the shape of tokens that are so wide."""
         if type(self._conditioner).inject is Conditioner.inject:
             return
-        expect(takes_widths(self.target), "it acts after layers, but does not take `widths`")
         conditioning = self.make(**FIT, widths=WIDTHS)(self._actions())
         for layer, width in enumerate(WIDTHS):
             tokens = noise((1, 4, TOKENS, width), seed=1)

@@ -1,30 +1,40 @@
-"""`check_model`: the contract of every dynamics model, and what flows require of a denoiser."""
+"""`check_model`: the contract of dynamics models, and what objectives require of each kind."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from acwm_core.checks.dynamics import DynamicsChecks, Probe
-from acwm_core.checks.result import CheckResult, Suite, expect, expect_equal, run_checks
-from acwm_core.checks.trial import batch_error, noise, shaken
+from acwm_core.checks.result import (
+    CheckResult,
+    Suite,
+    expect,
+    expect_equal,
+    expect_is_a,
+    run_checks,
+)
+from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
 from acwm_core.errors import RecipeError
-from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.dynamics import Cache, DynamicsModel
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.dynamics import Cache, Denoiser, DynamicsModel, LatentStream, Predictor
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.flow import drawn_noise, evaluation
+from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.regression import Regression
+from acwm_core.model.shapes import Actions, Latent, Tokens
 
-CHANNELS = 4
+SHAPE = (2, 4, 4, 8, 8)
+"""B, L, C, h, w of the latents used in the checks."""
 
 
 def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Iterator[CheckResult]:
     """Check a model against the contract of `acwm_core.model.dynamics.DynamicsModel`.
 
-    A denoiser is also checked against the contract of `acwm_core.model.denoiser.Denoiser`.
+    A denoiser is also checked against the contract of `acwm_core.model.dynamics.Denoiser`.
 
     Weights are perturbed first: many models start with zero layers, which would hide their inputs.
 
@@ -41,6 +51,257 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
         yield from DenoiserChecks.check(model, **params)
 
 
+Place = int | Literal["input"]
+"""Where a conditioner acts: before the first layer, or after the layer of this number."""
+
+
+class Probe(Conditioner):
+    """Records where it is called, and changes the tokens at some places.
+
+    Args:
+        changed: the places where it adds something to the tokens.
+
+    Attributes:
+        called: the places where it was called, in order, each with the width of the tokens.
+    """
+
+    def __init__(self, changed: Iterable[Place] = ()) -> None:
+        super().__init__()
+        self.changed = {*changed}
+        self.called: list[tuple[Place, int]] = []
+
+    def forward(self, actions: Actions) -> Conditioning:
+        """An empty conditioning; `actions` are ignored."""
+        return Conditioning(None, None, self)
+
+    def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Record the call."""
+        return self._act("input", tokens)
+
+    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
+        """Record the call."""
+        return self._act(layer, tokens)
+
+    def _act(self, place: Place, tokens: Tokens) -> Tokens:
+        width = tokens.shape[-1]
+        self.called.append((place, width))
+        return tokens + noise((width,), seed=5) if place in self.changed else tokens
+
+
+class DynamicsChecks(Suite):
+    """Checks of a model on random latents; weights are perturbed so that no layer is zero."""
+
+    kind = "model"
+
+    @functools.cached_property
+    def _model(self) -> DynamicsModel:
+        return shaken(self.make(latent_channels=SHAPE[2])).eval()
+
+    @functools.cached_property
+    def _objective(self) -> Objective[Any]:
+        return DenoisingTrial(prediction="clean", steps=2) if self.is_denoiser else Regression()
+
+    def _conditioning(self, modulation: Tensor, probe: Probe | None = None) -> Conditioning:
+        return Conditioning(modulation, None, probe or Probe())
+
+    def _inputs(self) -> tuple[Latent, Tensor]:
+        """Random latents `[B, L, C, h, w]` and modulation `[B, L, D]`."""
+        return noise(SHAPE, seed=1), noise((*SHAPE[:2], self._model.width), seed=3)
+
+    @torch.no_grad()
+    def _predict(self, given: Latent, modulation: Tensor, probe: Probe | None = None) -> Latent:
+        conditioning = self._conditioning(modulation, probe)
+        generators = draws(len(given))
+        return self._objective.predict(self._model, given, conditioning, SHAPE[1], generators)
+
+    @property
+    def is_denoiser(self) -> bool:
+        """Whether the model is a denoiser; False if it cannot be constructed."""
+        try:
+            return isinstance(self._model, Denoiser)
+        except Exception:  # already reported by the check `can_be_constructed`
+            return False
+
+    def can_be_constructed(self) -> None:
+        """Construct the model and find `width`, `layers`, `heads` and `causal`."""
+        expect_is_a(self._model, DynamicsModel)
+        expect(
+            isinstance(self._model, Denoiser | Predictor),
+            "it is neither a Denoiser nor a Predictor, so no objective can train it",
+        )
+        expect_is_a(self._model.causal, bool)
+        for name, least in (("width", 1), ("layers", 0), ("heads", 1)):
+            value = getattr(self._model, name, None)
+            expect_is_a(value, int)
+            expect(value is not None and value >= least, f"{name} is {value!r}, below {least}")
+        widths, heads = self._model.widths, self._model.heads
+        expect_equal("the number of widths is", len(widths), self._model.layers)
+        for width in widths:
+            expect_is_a(width, int)
+            fits = width > 0 and width % heads == 0
+            expect(fits, f"{heads} heads do not divide the width {width} of a layer")
+
+    def gradient_reaches_every_parameter(self) -> None:
+        """Return a finite loss that trains all parameters, with 1 or 2 given frames."""
+        latents, modulation = self._inputs()
+        conditioning, generators = self._conditioning(modulation), draws(len(latents))
+        for known in (2, 1):
+            loss = self._objective.loss(self._model, latents, conditioning, generators, known)
+            expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
+            idle = without_gradient(self._model, loss)
+            expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
+
+    def names_its_own_matrices(self) -> None:
+        """Let `matrices` list parameters of the model that have two dimensions, each once."""
+        own = {id(parameter) for parameter in self._model.parameters()}
+        listed = self._model.matrices()
+        expect_is_a(listed, list)
+        found = [id(each) for each in listed]
+        expect({*found} <= own, "matrices lists what is no parameter of the model")
+        expect(len({*found}) == len(found), "matrices lists a parameter twice")
+        wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
+        expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
+
+    def keeps_the_given_frames(self) -> None:
+        """Predict finite latents of the requested length; 1 or 2 given frames stay unchanged."""
+        latents, modulation = self._inputs()
+        for known in (1, 2):
+            given = latents[:, :known]
+            predicted = self._predict(given, modulation)
+            expect_equal("predicts", [*predicted.shape], [*SHAPE])
+            expect(predicted.isfinite().all(), "the prediction is not finite")
+            expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
+
+    def elements_of_a_batch_are_independent(self) -> None:
+        """Predict an element the same way whatever else is in the batch."""
+        latents, modulation = self._inputs()
+        whole = self._predict(latents[:, :1], modulation)[:1]
+        error = batch_error(whole, self._predict(latents[:1, :1], modulation[:1]))
+        expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
+
+    def depends_on_the_first_frame_and_the_actions(self) -> None:
+        """Let every predicted frame depend on the first one and on the actions."""
+        latents, modulation = self._inputs()
+        usual = self._predict(latents[:, :1], modulation)
+        for what, changed in (
+            ("the first frame", self._predict(-latents[:, :1], modulation)),
+            ("the actions", self._predict(latents[:, :1], -modulation)),
+        ):
+            for frame in range(1, SHAPE[1]):
+                same = torch.equal(usual[:, frame], changed[:, frame])
+                expect(not same, f"what it predicts of latent frame {frame} ignores {what}")
+
+    def later_actions_change_nothing_if_causal(self) -> None:
+        """With `causal` true, predict a frame independently of the actions after it."""
+        latents, modulation = self._inputs()
+        other = modulation.clone()
+        other[:, -1] += 1
+        usual, changed = (self._predict(latents[:, :1], m) for m in (modulation, other))
+        error = batch_error(usual[:, :-1], changed[:, :-1])
+        what = f"earlier frames change by {error:.2g} with the last action"
+        expect(error < 1e-4 or not self._model.causal, what)
+
+    def lets_the_conditioner_act_at_the_input(self) -> None:
+        """With layers, call `inject_input` before the first, and go on with what it returns."""
+        if self._model.layers:
+            self._expect_heeded("input", self._model.width, "inject_input")
+
+    def lets_the_conditioner_act_after_every_layer(self) -> None:
+        """Call `inject` after each layer, with its width, and go on with what it returns."""
+        for layer, width in enumerate(self._model.widths):
+            self._expect_heeded(layer, width, f"inject for layer {layer}")
+
+    def _expect_heeded(self, place: Place, width: int, method: str) -> None:
+        """Expect tokens of this width at a place, and another prediction if they change there."""
+        latents, modulation = self._inputs()
+        usual, probe = self._predict(latents[:, :1], modulation), Probe([place])
+        changed = self._predict(latents[:, :1], modulation, probe)
+        found = {wide for where, wide in probe.called if where == place}
+        why = "so a conditioner that acts there has no effect"
+        expect(found, f"it never calls {method}, {why}")
+        expect_equal(f"{method} gets tokens of the width", [*found], [width])
+        expect(not torch.equal(usual, changed), f"it ignores the tokens of {method}, {why}")
+
+    def streams_what_it_predicts(self) -> None:
+        """Stream finite frames (the same as predicted, unless a denoiser), or refuse to stream."""
+        latents, modulation = self._inputs()
+        frames, conditioning = SHAPE[1], self._conditioning(modulation)
+        objective, model = self._objective, self._model
+        for known in (1, 2) if not (isinstance(model, Denoiser) and model.inputs) else ():
+            given = latents[:, :known]
+            try:
+                stream = objective.stream(model, given, draws(len(given)), context=frames)
+            except RecipeError:
+                what = "it refuses to stream as it was trained"
+                expect(not objective.streams_by_default(model), what)
+                return
+            expect(model.causal, "it streams, but does not say that it is causal")
+            streamed = played(stream, conditioning, known, frames)
+            predicted = self._predict(given, modulation)[:, known:]
+            expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
+            expect(streamed.isfinite().all(), "a streamed frame is not finite")
+            error = batch_error(predicted, streamed)
+            what = f"after {known} given frames a stream and a prediction differ by {error:.2g}"
+            expect(error < 1e-3 or self.is_denoiser, what)
+
+
+class DenoisingTrial(DiffusionForcing):
+    """Trains and samples any denoiser; its further inputs are noise that is always the same."""
+
+    causal = False
+
+    def loss(
+        self,
+        model: Denoiser,
+        latents: Latent,
+        conditioning: Conditioning,
+        generators: Sequence[torch.Generator],
+        known: int,
+    ) -> Tensor:
+        """See `Objective.loss`."""
+        evaluate = evaluation(model, conditioning, **further_inputs(model, *latents.shape))
+        return self.error(evaluate, latents, generators, known)
+
+    def predict(
+        self,
+        model: Denoiser,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """See `Objective.predict`."""
+        shape = (len(given), frames, *given.shape[2:])
+        evaluate = evaluation(model, conditioning, **further_inputs(model, *shape))
+        return self.sample(evaluate, drawn_noise(shape[1:], generators), given, steps)
+
+
+def further_inputs(model: Denoiser, batch: int, frames: int, *size: int) -> dict[str, Tensor]:
+    """Random further inputs of a denoiser, the same for all elements of a batch."""
+    shapes = {"latent": (1, frames, *size), "level": (1, frames)}
+    drawn = {name: noise(shapes[kind], seed=6) for name, kind in model.inputs.items()}
+    return {
+        name: (each.sigmoid() if each.ndim == 2 else each).expand(batch, *each.shape[1:])
+        for name, each in drawn.items()
+    }
+
+
+def draws(batch: int) -> list[torch.Generator]:
+    """A generator for each clip of a batch."""
+    return [torch.Generator().manual_seed(seed) for seed in range(batch)]
+
+
+@torch.no_grad()
+def played(stream: LatentStream, conditioning: Conditioning, known: int, frames: int) -> Latent:
+    """The frames of a stream after `known` given ones, up to `frames` in all."""
+    seen = [0, *range(known, frames - 1)]  # the first call covers all given frames
+    ends = range(known + 1, frames + 1)
+    return torch.cat(
+        [stream.advance(conditioning.frames(*each)) for each in zip(seen, ends, strict=True)], 1
+    )
+
+
 class DenoiserChecks(Suite):
     """Checks of a denoiser on random latents."""
 
@@ -48,7 +309,7 @@ class DenoiserChecks(Suite):
 
     @functools.cached_property
     def _model(self) -> Denoiser:
-        return shaken(self.make(latent_channels=CHANNELS)).eval()
+        return shaken(self.make(latent_channels=SHAPE[2])).eval()
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
         modulation = noise((batch, frames, self._model.width), seed)
@@ -59,21 +320,26 @@ class DenoiserChecks(Suite):
     ) -> tuple[Tensor, Tensor, Conditioning]:
         """Random latents, noise levels (0 for the first frame) and conditioning."""
         sigma = torch.linspace(0, 0.9, frames).repeat(batch, 1)
-        latents = noise((batch, frames, CHANNELS, height, width), seed=1)
+        latents = noise((batch, frames, SHAPE[2], height, width), seed=1)
         return latents, sigma, self._conditioning(batch, frames)
 
     @torch.no_grad()
-    def _run(self, latents: Tensor, sigma: Tensor, conditioning: Conditioning) -> Tensor:
-        return self._model(latents, sigma, conditioning)
+    def _run(
+        self, latents: Tensor, sigma: Tensor, conditioning: Conditioning, **changed: Tensor
+    ) -> Tensor:
+        inputs = further_inputs(self._model, *latents.shape)
+        return self._model(latents, sigma, conditioning, **{**inputs, **changed})
 
     @torch.no_grad()
     def _extend(
-        self, cache: Cache, inputs: tuple[Tensor, Tensor, Conditioning], start: int, stop: int
+        self, cache: Cache, clip: tuple[Tensor, Tensor, Conditioning], start: int, stop: int
     ) -> Tensor:
-        latents, sigma, conditioning = inputs
+        latents, sigma, conditioning = clip
         rows = slice(start, stop)
+        inputs = further_inputs(self._model, *latents.shape)
+        now = {name: each[:, rows] for name, each in inputs.items()}
         frames = conditioning.frames(start, stop)
-        return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache)
+        return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache, **now)
 
     def keeps_the_shape(self) -> None:
         """Return finite predictions of the latents' shape, for any length and size."""
@@ -95,15 +361,15 @@ class DenoiserChecks(Suite):
                 same = torch.equal(usual[:, frame], changed[:, frame])
                 expect(not same, f"its prediction of a frame ignores the frame's {name}")
 
-    def sees_the_frame_before_if_it_says_so(self) -> None:
-        """With `previous` true, depend on the previous frame and its noise level."""
+    def sees_its_further_inputs(self) -> None:
+        """Let the prediction of a frame depend on each of its `inputs`."""
         latents, sigma, conditioning = self._inputs()
-        after = replace(conditioning, previous=-latents, previous_sigma=sigma / 2)
-        usual = self._run(latents, sigma, after)
-        other, noisier = replace(after, previous=latents), replace(after, previous_sigma=sigma)
-        for what, inputs in (("latents", other), ("noise level", noisier)):
-            same = torch.equal(usual, self._run(latents, sigma, inputs))
-            expect(not (same and self._model.previous), f"it ignores the {what} of the one before")
+        usual = self._run(latents, sigma, conditioning)
+        for name, given in further_inputs(self._model, *latents.shape).items():
+            changed = self._run(latents, sigma, conditioning, **{name: 1 - given})
+            for frame in range(latents.shape[1]):
+                same = torch.equal(usual[:, frame], changed[:, frame])
+                expect(not same, f"its prediction of a frame ignores the frame's input {name}")
 
     def is_causal_if_it_says_so(self) -> None:
         """With `causal` true, predict a frame independently of later ones."""

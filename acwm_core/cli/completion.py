@@ -11,8 +11,9 @@ from click.shell_completion import CompletionItem
 
 from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
-from acwm_core.recipe.check import LIGHT, check_names
+from acwm_core.recipe.check import SECTIONS, check_names
 from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
+from acwm_core.recipe.objective import INHERITED, resolved
 from acwm_core.recipe.recipe import flat_items
 from acwm_core.recipe.signature import signature
 from acwm_core.recipe.types import show
@@ -77,9 +78,9 @@ def _values(ctx: click.Context, key: str) -> list[str]:
     kind = "environment" if section == "env" else section
     if section in COMPONENTS and not parameter:
         return [name for name, _ in _named(kind)]
-    if section not in LIGHT:
+    if section not in SECTIONS:
         return []
-    takes = signature(resolve_name(LIGHT[section])).parameters
+    takes = signature(resolve_name(SECTIONS[section])).parameters
     found = takes[parameter].type if parameter in takes else None
     choices = get_args(found) if get_origin(found) is Literal else ()
     return ["true", "false"] if found is bool else [str(choice) for choice in choices]
@@ -91,7 +92,7 @@ def _recipe(ctx: click.Context) -> dict[str, Any]:
     if not name:
         return {}
     try:
-        recipe = read_recipe(name)
+        recipe = resolved(read_recipe(name))
         recipe |= check_names(recipe)
     except AcwmError:
         return {}
@@ -99,6 +100,7 @@ def _recipe(ctx: click.Context) -> dict[str, Any]:
         if chosen := recipe.get(section):
             kind = "environment" if section == "env" else section
             recipe[section] = {**catalog().component(kind, chosen["name"]).defaults, **chosen}
+    recipe["objective"].pop(INHERITED, None)
     return recipe
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SECTIONS: Mapping[str, str] = {
     "environment": "env",
-    **{kind: kind for kind in ("codec", "model", "conditioner", "metric")},
+    **{kind: kind for kind in ("codec", "model", "conditioner", "objective", "metric")},
 }
 """Kinds whose parameters can be set by overrides, and the section that such overrides name."""
 

@@ -55,7 +55,7 @@ def provenance(
         "parameters": sum(parameter.numel() for parameter in trained),
         "codec_fingerprint": world_model.codec.fingerprint(),
         "evaluation": asdict(config),
-        "sampling_steps": config.steps or world_model.model.sampling_steps,
+        "sampling_steps": config.steps or world_model.objective.steps or 1,
         "mode": config.mode or world_model.mode,
         "context_frames": evaluator.given,
         "dataset": {

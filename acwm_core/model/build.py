@@ -2,45 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, cast
 
-import torch
-from torch import nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
-
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors import PluginError, RecipeError
+from acwm_core.errors import PluginError
 from acwm_core.model.codec import Codec
-from acwm_core.model.conditioner import Conditioner, takes_widths
-from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, Recipe
 
 ComponentT = TypeVar("ComponentT")
-
-MAX_TENSORS = 5_000
-"""Largest number of weight tensors of a component; the largest models have hundreds of layers."""
-
-
-def build_codec(choice: ComponentConfig) -> Codec:
-    """Build the codec that a recipe names.
-
-    Raises:
-        UnknownNameError: no codec has that name.
-        PluginError: the registered target is not a `Codec`, or has an invalid attribute.
-    """
-    codec = build_component("codec", choice, Codec)
-    for name in ("channels", "spatial_stride", "temporal_stride"):
-        if not isinstance(value := getattr(codec, name), int) or value < 1:
-            raise PluginError(f"codec {choice.name!r} has {name}={value!r}, not a positive integer")
-    return codec
 
 
 class CardOfData(Protocol):
@@ -53,7 +28,7 @@ class CardOfData(Protocol):
 
 
 def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> WorldModel:
-    """Build codec, model and conditioner from a recipe, with freshly initialised weights.
+    """Build codec, model, conditioner and objective of a recipe, with freshly initialised weights.
 
     Values that one component needs from another (latent channels, width, action size, causality)
     are passed on here, so that recipes need not repeat them.
@@ -63,48 +38,47 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
 
     Raises:
         UnknownNameError, MissingExtraError, PluginError: a component cannot be created.
-        RecipeError: the model cannot be trained with the recipe's objective or on its clips.
+        RecipeError: the components do not fit together, or the model not the recipe's clips.
     """
     card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
-    flow = Flow(**recipe.flow)
-    model = build_model(recipe.model, flow, codec.channels)
+    objective = build_objective(recipe.objective)
+    model = build_model(recipe.model, objective, codec.channels)
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
+    bounds = card.action.low, card.action.high
     clips = {name: recipe.data[name] for name in ("clip_frames", "context_frames")}
-    return WorldModel(codec, model, conditioner, card.action.low, card.action.high, **clips)
+    return WorldModel(codec, model, conditioner, objective, *bounds, **clips)
 
 
-def build_model(choice: ComponentConfig, flow: Flow, latent_channels: int) -> DynamicsModel:
-    """Build the dynamics model that a recipe names; a denoiser is causal if the objective needs it.
+def build_codec(choice: ComponentConfig) -> Codec:
+    """Build the codec that a recipe names."""
+    codec = build_component("codec", choice, Codec)
+    for name in ("channels", "spatial_stride", "temporal_stride"):
+        if not isinstance(value := getattr(codec, name), int) or value < 1:
+            raise PluginError(f"codec {choice.name!r} has {name}={value!r}, not a positive integer")
+    return codec
+
+
+def build_objective(choice: ComponentConfig) -> Objective[Any]:
+    """Build the objective that a recipe names."""
+    return build_component("objective", choice, cast("type[Objective[Any]]", Objective))
+
+
+def build_model(
+    choice: ComponentConfig, objective: Objective[Any], latent_channels: int
+) -> DynamicsModel:
+    """Build the dynamics model that a recipe names, as the objective needs it.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: the model cannot be created.
-        RecipeError: the objective needs a denoiser that is causal or looks at the previous frame,
-            and this one does not.
+        RecipeError: the objective cannot train this model.
     """
-    wanted = {
-        "causal": flow.objective != "full_sequence",
-        "previous": flow.objective == "next_frame",
-    }
+    wanted = {"causal": objective.causal, "inputs": objective.inputs}
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
     model = build_component("model", choice, DynamicsModel, latent_channels=latent_channels)
-    if not isinstance(model, Denoiser):
-        return model
-    model.flow = flow
-    if wanted["previous"] and not model.previous:
-        raise RecipeError(
-            "flow.objective=next_frame needs a model that takes the previous frame as "
-            f"input, which {choice.name} does not: choose flow.objective=diffusion_forcing"
-        )
-    if wanted["causal"] and not model.causal:
-        raise RecipeError(
-            f"flow.objective={flow.objective} needs a model that is causal in time, but "
-            f"{choice.name} with these parameters is not: set model.causal=true if it has that "
-            "parameter, or flow.objective=full_sequence"
-        )
+    objective.check_model(model)
     return model
 
 
@@ -114,29 +88,18 @@ def build_conditioner(
     """Build the conditioner that a recipe names, to fit a model.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: it cannot be created.
-        RecipeError: it has layers of its own, which cannot follow the model's different widths.
+        RecipeError: it is made for layers of one width, and the model's differ.
     """
-    follows = takes_widths(catalog().component("conditioner", choice.name).load())
-    conditioner = build_component(
-        "conditioner",
-        choice,
-        Conditioner,
-        action_size=action_size,
-        temporal_stride=temporal_stride,
-        width=model.width,
-        layers=model.layers,
-        heads=model.heads,
-        **({"widths": model.widths} if follows else {}),
-    )
-    acts_after_layers = type(conditioner).inject is not Conditioner.inject
-    if acts_after_layers and not follows and {*model.widths} - {model.width}:
-        raise RecipeError(
-            f"conditioner={choice.name} follows layers of one width only, and those of this "
-            f"{type(model).__name__} are {', '.join(map(str, model.widths))} wide: choose another "
-            "conditioner, or let it take the argument widths"
-        )
-    return conditioner
+    fitted: dict[str, Any] = {
+        "action_size": action_size,
+        "temporal_stride": temporal_stride,
+        "width": model.width,
+        "layers": model.layers,
+        "heads": model.heads,
+    }
+    if {*model.widths} - {model.width}:
+        fitted["widths"] = model.widths
+    return build_component("conditioner", choice, Conditioner, **fitted)
 
 
 def build_component(
@@ -146,43 +109,5 @@ def build_component(
 
     Args:
         **fitted: constructor arguments that follow from the other components.
-
-    Raises:
-        UnknownNameError, MissingExtraError: it cannot be created.
-        PluginError: the registered target is not a `base`.
     """
-    component = catalog().component(kind, choice.name)
-    what = f"{kind}={choice.name}"
-    if kind in ("model", "conditioner"):  # others may load weights in their constructor
-        fork = cast(Any, torch.random).fork_rng(devices=[])
-        with contextlib.suppress(*_NOT_ABSTRACT), _bounded(what), fork, torch.device("meta"):
-            component.create_as(base, **fitted, **choice.params)
-    with _bounded(what):
-        return component.create_as(base, **fitted, **choice.params)
-
-
-_NOT_ABSTRACT = (RuntimeError, NotImplementedError, ValueError, TypeError)
-"""Errors of a component that cannot be built on the meta device. Real errors are raised again by
-the build that follows."""
-
-
-@contextlib.contextmanager
-def _bounded(what: str) -> Generator[None]:
-    """Stop the construction of a component once it exceeds the memory of this machine."""
-    memory, held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), [0, 0]
-
-    def count(_module: nn.Module, _name: str, parameter: nn.Parameter | None) -> None:
-        if parameter is not None:
-            held[0] += 1
-            held[1] += parameter.numel() * parameter.itemsize
-        if held[0] > MAX_TENSORS or held[1] > memory:
-            raise RecipeError(
-                f"{what} is too large as the recipe has it: more than {MAX_TENSORS} weight tensors "
-                f"or the {memory / 1e9:.0f} GB of this machine; make it smaller"
-            )
-
-    hook = register_module_parameter_registration_hook(count)
-    try:
-        yield
-    finally:
-        hook.remove()
+    return catalog().component(kind, choice.name).create_as(base, **fitted, **choice.params)

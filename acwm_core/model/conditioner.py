@@ -6,16 +6,13 @@ the same model works with every conditioner.
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor, nn
 
 from acwm_core.errors import PluginError, check_shape
-from acwm_core.model.shapes import Actions, Latent, Modulation, Sigmas, Tokens
+from acwm_core.model.shapes import Actions, Modulation, Tokens
 
 
 @dataclass(frozen=True)
@@ -28,16 +25,11 @@ class Conditioning:
         context: `[B, L, K, D]`, K tokens per latent frame for what the conditioner does at the
             input and after layers, or None.
         conditioner: the conditioner that made this and whose layers apply it.
-        previous: the latent frame before each one, `[B, L, C, h, w]`, for a denoiser trained with
-            `flow.objective=next_frame`; else None.
-        previous_sigma: noise level of each frame in `previous`, `[B, L]`.
     """
 
     modulation: Modulation | None
     context: Tensor | None
     conditioner: Conditioner
-    previous: Latent | None = None
-    previous_sigma: Sigmas | None = None
 
     def inject_input(self, tokens: Tokens) -> Tokens:
         """Let the conditioner change the tokens `[B, L, N, D]` before the model's first layer."""
@@ -54,11 +46,11 @@ class Conditioning:
 
     def frames(self, start: int, stop: int) -> Conditioning:
         """The conditioning of latent frames `start` to `stop` only."""
-        modulation, context, previous, sigma = (
+        modulation, context = (
             None if part is None else part[:, start:stop]
-            for part in (self.modulation, self.context, self.previous, self.previous_sigma)
+            for part in (self.modulation, self.context)
         )
-        return Conditioning(modulation, context, self.conditioner, previous, sigma)
+        return Conditioning(modulation, context, self.conditioner)
 
 
 class Conditioner(nn.Module, ABC):
@@ -73,9 +65,8 @@ class Conditioner(nn.Module, ABC):
         width: width D of modulation, context and the tokens at the input.
         layers: number of layers of the model.
         heads: number of attention heads of the model.
-        widths: width of the tokens after each layer, as `tuple[int, ...]`. Only a conditioner with
-            an `inject` of its own takes it; one that does not fits only models whose layers are all
-            as wide as `width`.
+        widths: width of the tokens after each layer, as `tuple[int, ...]`; given only if they
+            differ from `width`, so a conditioner that does not take it fits all other models.
 
     Attributes:
         history: number of latent steps of actions, up to and including its own, on which the entry
@@ -125,11 +116,3 @@ class Conditioner(nn.Module, ABC):
             Tokens of the same shape.
         """
         return tokens
-
-
-def takes_widths(conditioner: Callable[..., Any]) -> bool:
-    """Whether a conditioner's class, or a function that makes one, names the argument `widths`.
-
-    ``**others`` does not count, as it is often passed on to a class without it.
-    """
-    return "widths" in inspect.signature(conditioner).parameters

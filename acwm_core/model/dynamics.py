@@ -1,26 +1,28 @@
-"""The `DynamicsModel` interface: predicts latents from latents and actions."""
+"""The interfaces of dynamics models, which objectives train: `Denoiser` and `Predictor`."""
 
 from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Mapping
+from typing import Literal, cast
 
-import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.shapes import Latent
+from acwm_core.model.shapes import Latent, Sigmas
+
+InputKind = Literal["latent", "level"]
+"""A further input of a denoiser: latents `[B, L, C, h, w]`, or a number in [0, 1] for each latent
+frame `[B, L]`."""
 
 
 class DynamicsModel(nn.Module, ABC):
-    """Predicts the latent frames that follow given ones, from embedded actions.
+    """A network that an objective trains to predict latent frames from embedded actions.
 
-    The method is up to the model: a `Denoiser` removes noise step by step, another
-    may compute the next frame directly. All have a training loss, the prediction of a clip, and
-    optionally a stream that carries its state from frame to frame.
+    It is a `Denoiser`, which takes part in a sampling that removes noise step by step, or a
+    `Predictor`, which computes the frames at once.
 
     Every model takes the keyword argument `latent_channels`, which the framework fills in from the
     codec. Its own parameters come after it and are set in the recipe. The latent size h × w and the
@@ -36,84 +38,17 @@ class DynamicsModel(nn.Module, ABC):
             modulation.
         heads: number of attention heads, passed to the conditioner; divides all `widths`.
         causal: whether the prediction of a latent frame depends on no later frame.
-        sampling_steps: default number of network evaluations per prediction.
-        streams_by_default: whether it was trained for its stream, which is then the default mode
-            of rollouts.
-        given_frames: number K of given latent frames in a training clip; the framework sets it.
     """
 
     width: int
     layers: int
     heads: int
     causal: bool = False
-    sampling_steps: int = 1
-    streams_by_default: bool = False
-    given_frames: int = 1
 
     @functools.cached_property
     def widths(self) -> tuple[int, ...]:
         """Width of the tokens after each layer; `width` for all of them unless a model sets it."""
         return (self.width,) * self.layers
-
-    @abstractmethod
-    def loss(
-        self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """Training loss of a batch of clips, a scalar, over the frames after the `given_frames`.
-
-        Args:
-            latents: clean latents `[B, L, C, h, w]`, L > `given_frames`.
-            conditioning: the embedded actions of the clips.
-            generators: one CPU generator per clip. All random numbers of a clip come from it, so
-                they depend neither on the other clips of the batch nor on the device.
-        """
-
-    @abstractmethod
-    def predict(
-        self,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
-    ) -> Latent:
-        """Predict a clip that starts with the given latent frames.
-
-        Args:
-            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
-            conditioning: the embedded actions of the clip.
-            frames: length L of the clip, including the given frames.
-            generators: one CPU generator per clip, as in `loss`.
-            steps: number of network evaluations, if the model has a choice; `sampling_steps` by
-                default.
-
-        Returns:
-            `[B, L, C, h, w]`; its first K frames are `given`.
-        """
-
-    def stream(
-        self,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        *,
-        steps: int | None = None,
-        context: int,
-    ) -> LatentStream:
-        """Predict one latent frame at a time, without end. Optional, for causal models.
-
-        Args:
-            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
-            generators: one CPU generator per clip.
-            steps: as in `predict`.
-            context: number of latent frames that a frame sees, including itself, at least 2; for
-                models whose memory is bounded in this way.
-
-        Raises:
-            RecipeError: the model cannot be evaluated frame by frame, or was not trained for it.
-        """
-        raise RecipeError(
-            f"{type(self).__name__} has no cache of earlier frames, so it cannot be streamed"
-        )
 
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices, which Muon updates; AdamW updates all other parameters.
@@ -123,6 +58,112 @@ class DynamicsModel(nn.Module, ABC):
         layers within repeated blocks (children of a `ModuleList`).
         """
         return hidden_matrices(self)
+
+
+class Denoiser(DynamicsModel):
+    """A network that is evaluated on noisy latents, as often as its objective asks for.
+
+    A denoiser that can be built causal or not takes the argument `causal: bool | None = None`. One
+    that can take further inputs takes `inputs: Mapping[str, InputKind] | None = None`. If a recipe
+    leaves them None, the framework sets what the recipe's objective needs.
+
+    Attributes:
+        inputs: the further inputs that `forward` and `extend` take, by name.
+    """
+
+    inputs: Mapping[str, InputKind] = {}
+
+    @abstractmethod
+    def forward(
+        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, **inputs: Tensor
+    ) -> Latent:
+        """Evaluate the network once. What its output means, e.g. a velocity, the objective says.
+
+        Args:
+            latents: noisy latents `[B, L, C, h, w]`; those of given frames are clean.
+            sigma: noise level of each latent frame `[B, L]`, from 0 (clean) to 1 (noise).
+            conditioning: the embedded actions; the model adds `modulation` to its timestep
+                embedding, and calls `inject_input` once before its first layer and `inject` once
+                after each layer.
+            **inputs: all of `self.inputs`. A level is embedded as `sigma` is, and further latents
+                as the noisy ones are; a model without any need not take them.
+
+        Returns:
+            The prediction, in the shape of `latents`.
+        """
+
+    def new_cache(self, context: int) -> Cache:
+        """Create an empty cache for `extend`, in which a latent frame sees the last `context` ones.
+
+        Raises:
+            RecipeError: the model cannot be evaluated frame by frame.
+        """
+        raise RecipeError(
+            f"{type(self).__name__} has no cache of earlier frames, so it cannot be streamed"
+        )
+
+    def extend(
+        self,
+        latents: Latent,
+        sigma: Sigmas,
+        conditioning: Conditioning,
+        cache: Cache,
+        **inputs: Tensor,
+    ) -> Latent:
+        """Evaluate the latent frames that follow those in `cache`. Optional, for causal models.
+
+        The result equals an evaluation of all frames since the start at once, in which earlier
+        frames have the latents and noise levels they were cached with, and each frame sees the last
+        `cache.context` ones in every layer. Nothing is cached until `cache.keep` is called, so the
+        same frames can be evaluated repeatedly.
+
+        Args:
+            latents: `[B, n, C, h, w]`, n ≥ 1.
+            sigma: noise levels `[B, n]`.
+            conditioning: of these n frames.
+            cache: from this model's `new_cache`, for one batch size and frame size.
+            **inputs: as in `forward`, of these n frames.
+
+        Returns:
+            The prediction, in the shape of `latents`.
+        """
+        raise RecipeError(f"{type(self).__name__} has no cache of earlier frames")
+
+
+class Predictor(DynamicsModel):
+    """A network that computes the frames after the given ones at once, without noise.
+
+    Attributes:
+        streams: whether it implements `stream`, which is then the default mode of rollouts.
+    """
+
+    streams: bool = False
+
+    @abstractmethod
+    def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
+        """Predict the latent frames of a clip that follow the given ones.
+
+        Args:
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
+            conditioning: the embedded actions of the clip.
+            frames: length L of the clip, including the given frames.
+
+        Returns:
+            `[B, L − K, C, h, w]`.
+        """
+
+    def stream(self, given: Latent, *, context: int) -> LatentStream:
+        """Predict one latent frame at a time, without end. Optional, for causal models.
+
+        Args:
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
+            context: number of latent frames that a frame sees, including itself, at least 2; for
+                models whose memory is bounded in this way.
+
+        Raises:
+            RecipeError: the model cannot be evaluated frame by frame.
+        """
+        raise RecipeError(f"{type(self).__name__} has no `stream`, so it cannot be streamed")
 
 
 class LatentStream(ABC):
@@ -140,16 +181,13 @@ class LatentStream(ABC):
 
 
 class Cache(ABC):
-    """State that a causal model keeps of earlier latent frames, in constant memory.
+    """State that a causal denoiser keeps of earlier latent frames, in constant memory.
 
     Args:
         context: number of latent frames that a frame sees, including itself; at least 2.
 
     Attributes:
         frames: number of latent frames cached since the start, even if they left the context.
-
-    Raises:
-        RecipeError: the context is below 2, which would remember nothing.
     """
 
     def __init__(self, context: int) -> None:

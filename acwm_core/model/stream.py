@@ -3,36 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.model.codec import Codec
-from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.shapes import Actions, Latent, Video
+
+if TYPE_CHECKING:
+    from acwm_core.model.world_model import WorldModel
 
 
 def continued(actions: Actions, rows: int) -> Actions:
     """`actions` `[B, T, A]` with the last one repeated for `rows` more rows."""
     return torch.cat([actions, actions[:, -1:].expand(-1, rows, -1)], dim=1)
-
-
-class Streamable(Protocol):
-    """The parts of a world model that a stream needs."""
-
-    codec: Codec
-    model: DynamicsModel
-    conditioner: Conditioner
-
-    def checked(self, actions: Actions) -> Actions:
-        """Return the raw actions `[B, T, A]` unchanged, if they are valid."""
-        ...
-
-    def normalise(self, actions: Actions) -> Actions:
-        """Scale raw actions `[B, T, A]` to [-1, 1]."""
-        ...
 
 
 class Stream:
@@ -42,7 +27,7 @@ class Stream:
     however long the video is.
 
     Args:
-        world: codec, causal model and conditioner.
+        world: the world model, whose dynamics model is causal.
         given: the first K frames, `[B, K, 3, H, W]` in [0, 1]; they form whole latent frames.
         actions: raw actions between them, `[B, K − 1, A]`.
         steps: network evaluations per latent frame; the model's default if None.
@@ -60,7 +45,7 @@ class Stream:
 
     def __init__(
         self,
-        world: Streamable,
+        world: WorldModel,
         given: Video,
         actions: Actions,
         *,
@@ -80,7 +65,9 @@ class Stream:
         self._recent = [*between] if frames > 1 else []
         with torch.no_grad():
             latents = world.codec.encode(given)
-            self._latents = world.model.stream(latents, generators, steps=steps, context=context)
+            self._latents = world.objective.stream(
+                world.model, latents, generators, steps=steps, context=context
+            )
             self._decode = world.codec.frame_decoder()
             self.given = self._decode(latents)
         self.first, self._untold = self.given[:, 0], latents.shape[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,7 @@ from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.model.stream import Stream, continued
 
@@ -32,6 +33,7 @@ class WorldModel(nn.Module):
         codec: it is frozen here and stays in evaluation mode, also after `train()`.
         model: predicts latents.
         conditioner: built to fit the model.
+        objective: how the model learns and predicts.
         action_low: lower action bounds in raw units, from the environment card.
         action_high: upper bounds; both are used to normalise actions to [-1, 1].
         clip_frames: number of frames of a training clip.
@@ -49,6 +51,7 @@ class WorldModel(nn.Module):
         codec: Codec,
         model: DynamicsModel,
         conditioner: Conditioner,
+        objective: Objective[Any],
         action_low: Sequence[float],
         action_high: Sequence[float],
         *,
@@ -63,9 +66,8 @@ class WorldModel(nn.Module):
                 f"{stride} frames per latent frame, and below data.clip_frames={clip_frames}"
             )
         self.clip_frames, self.context_frames = clip_frames, context_frames
-        model.given_frames = codec.latent_frames(context_frames)
         self.codec = codec.requires_grad_(False).eval()
-        self.model, self.conditioner = model, conditioner
+        self.model, self.conditioner, self.objective = model, conditioner, objective
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
 
@@ -77,7 +79,8 @@ class WorldModel(nn.Module):
     @property
     def mode(self) -> Mode:
         """Default mode of rollouts: "stream" if the model was trained for it, else "windows"."""
-        if not self.model.streams_by_default or self.conditioner.history is None:
+        streams = self.objective.streams_by_default(self.model)
+        if not streams or self.conditioner.history is None:
             return "windows"
         try:
             self.codec.frame_decoder()
@@ -108,7 +111,8 @@ class WorldModel(nn.Module):
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         rows = self._prepare(actions, latents.shape[1])
         conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
-        return self.model.loss(latents, conditioning, generators)
+        known = self.codec.latent_frames(self.context_frames)
+        return self.objective.loss(self.model, latents, conditioning, generators, known)
 
     def rollout(
         self,
@@ -220,8 +224,7 @@ class WorldModel(nn.Module):
             seeds: one per batch element; 0, 1, … by default.
 
         Raises:
-            RecipeError: the components cannot be streamed; a denoiser must be causal and trained
-                with `flow.objective=diffusion_forcing` or `next_frame`.
+            RecipeError: the components cannot be streamed.
             ShapeError: there is not one seed per batch element, frames or actions don't fit, or
                 frames are not float in [0, 1].
             ActionError: actions have the wrong size or are not finite.
@@ -260,7 +263,9 @@ class WorldModel(nn.Module):
         rows = self._prepare(actions, length)
         conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
-            latents = self.model.predict(latents, conditioning, length, generators, steps)
+            latents = self.objective.predict(
+                self.model, latents, conditioning, length, generators, steps
+            )
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:

@@ -13,18 +13,17 @@ from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.metrics import MetricConfig, class_of_library, metric_configs
+from acwm_core.recipe.objective import INHERITED, resolved, with_current_sections
 from acwm_core.recipe.signature import REQUIRED, Signature, signature
 from acwm_core.renamed import without_removed
 
-LIGHT = {
+SECTIONS = {
     "training": "acwm_core.training.config:TrainingConfig",
     "data": "acwm_core.data.clips:DataConfig",
     "evaluation": "acwm_core.evaluation.config:EvaluationConfig",
 }
-"""The classes of sections that are checked without importing torch."""
-
-SECTIONS = {"flow": "acwm_core.model.flow:Flow", **LIGHT}
-"""For each section that is neither a component nor `trainer`, the class that gets its values."""
+"""For each section that is neither a component nor `trainer`, the class that gets its values. They
+are checked without importing torch."""
 
 REMOVED = {
     "data": {
@@ -55,8 +54,8 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         RecipeError: an unknown section, component or parameter, a wrong type, or something missing.
         PluginError: a registered target does not exist.
     """
+    recipe = resolved(with_current_sections(recipe))
     values = check_names(recipe)
-    values["flow"] = _check("flow", signature(resolve_name(SECTIONS["flow"])), values["flow"])
     listed, evaluation = _metrics(values["evaluation"]), values["evaluation"]
     for name, config in listed.items():
         check_metric_params(f"evaluation.metrics.{name}", config.component, config.params)
@@ -80,6 +79,7 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     Raises:
         RecipeError: an unknown section, component or flag, a wrong type, or something missing.
     """
+    recipe = resolved(recipe)
     plain = (*SECTIONS, "trainer")
     for name in recipe:
         if name not in (*COMPONENTS, *plain):
@@ -89,7 +89,7 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if section != "env" or recipe.get(section):  # env is optional: datasets know theirs
             _component(section, recipe.get(section))
     values = {section: dict(_mapping(section, recipe.get(section) or {})) for section in plain}
-    for section, target in LIGHT.items():
+    for section, target in SECTIONS.items():
         config = resolve_name(target)
         removed = REMOVED.get(section, {})
         values[section] = without_removed(values[section], removed, f"{section}.")
@@ -112,10 +112,13 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
         PluginError: a registered target does not exist.
     """
     component, params = _component(section, choice)
+    inherited = params.pop(INHERITED, {})
     values = {**component.defaults, **params}
     takes = signature(Environment)
     if section != "env" or values.keys() - takes.parameters:
         takes = _signature_of(component)
+    shared = {name: value for name, value in inherited.items() if name in takes.parameters}
+    values = {**component.defaults, **shared, **params}
     return {"name": component.name, **_check(section, takes, values, FITTED.get(section, ()))}
 
 
@@ -219,7 +222,7 @@ def _unknown(section: str, name: str, value: Any, taken: Signature) -> RecipeErr
 def _with_section(name: str) -> str:
     """A hint if `name` is a parameter of a light section or of Lightning's Trainer."""
     known = {
-        section: signature(resolve_name(target)).parameters for section, target in LIGHT.items()
+        section: signature(resolve_name(target)).parameters for section, target in SECTIONS.items()
     }
     owners = [s for s, names in {**known, "trainer": _trainer_flags()}.items() if name in names]
     return f"; did you mean {owners[0]}.{name}?" if owners else ""

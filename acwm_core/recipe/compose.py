@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.plugins import catalog
+from acwm_core.recipe.objective import INHERITED, chosen, inherited, with_current_sections
 from acwm_core.recipe.text import parse
 from acwm_core.renamed import with_new_names
 from acwm_core.untrusted import MAX_YAML, read_bytes
@@ -18,7 +19,7 @@ OVERLAYS = "overlays"
 RENAMED = {"evaluation": {"floor_episodes": "noise_floor_episodes"}}
 """Renamed parameters: for each section, a map from old to new names."""
 
-COMPONENTS = ("env", "codec", "model", "conditioner")
+COMPONENTS = ("env", "codec", "model", "conditioner", "objective")
 """Sections that hold a component, i.e. a registered name and its parameters."""
 
 
@@ -59,7 +60,7 @@ def with_overrides(
 
 
 def parse_override(override: str) -> dict[str, Any]:
-    """Parse an override such as ``flow.shift=5`` into a nested dict.
+    """Parse an override such as ``objective.shift=5`` into a nested dict.
 
     Raises:
         RecipeError: there is no ``=``, a name is empty, or the value is not YAML.
@@ -74,17 +75,21 @@ def parse_override(override: str) -> dict[str, Any]:
     value: Any = parse(text, f"the value of {override!r}")
     for name in reversed(names[1:]):
         value = {name: value}
-    return {names[0]: _normal(names[0], value)}
+    sections = with_current_sections({names[0]: value})
+    return {section: _normal(section, value) for section, value in sections.items()}
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep-merge recipes; if a component's name changes, its old parameters are dropped."""
+    """Deep-merge recipes; if a component's name changes, its old parameters are dropped.
+
+    A new objective inherits those that it takes too.
+    """
     kept = dict(base)
     for section in COMPONENTS:
         old, new = base.get(section), changes.get(section)
         if old and new and "name" in new and new["name"] != old.get("name"):
-            del kept[section]
-    return _merged(kept, changes)
+            kept[section] = inherited(old) if section == "objective" else {}
+    return chosen(changes, _merged(kept, changes))
 
 
 def recipe_folder() -> Path:
@@ -118,6 +123,7 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
     for name in names:
         recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
     own = with_new_names(own, {"instead": "replace", "words": "overrides"})
+    own = with_current_sections(own)
     recipe = _replaced(recipe, own.pop("replace", {}), path)
     changes = {section: _normal(section, value) for section, value in own.items()}
     codec: dict[str, Any] = changes.get("codec") or {}
@@ -149,10 +155,11 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
     ):
         raise RecipeError(f"`replace` in {path} must list replacements, as in model: {{old: new}}")
     for name, table in cast(Mapping[str, Mapping[Any, Any]], replacements).items():
-        section, _, parameter = str(name).partition(".")
+        name = "objective" if name == "flow.objective" else str(name)
+        section, _, parameter = name.replace("flow.", "objective.", 1).partition(".")
         values: Any = recipe.get(section)
         given = cast(dict[str, Any], values) if isinstance(values, dict) else {}
-        old = given.get(parameter or "name")
+        old = {**given.get(INHERITED, {}), **given}.get(parameter or "name")
         new = table.get(old) if isinstance(old, str) else None
         if new is not None:
             change = {parameter: new} if parameter else _normal(section, new)

@@ -56,7 +56,7 @@ class Recipe:
         codec: the video autoencoder.
         model: the dynamics model.
         conditioner: how actions enter the model.
-        flow: keyword arguments of `acwm_core.model.flow.Flow`.
+        objective: how the model learns and predicts.
         training: keyword arguments of `acwm_core.training.config.TrainingConfig`.
         data: keyword arguments of `acwm_core.data.clips.DataConfig`.
         evaluation: keyword arguments of `acwm_core.evaluation.config.EvaluationConfig`.
@@ -67,7 +67,7 @@ class Recipe:
     codec: ComponentConfig
     model: ComponentConfig
     conditioner: ComponentConfig
-    flow: dict[str, Any]
+    objective: ComponentConfig
     training: dict[str, Any]
     data: dict[str, Any]
     evaluation: dict[str, Any]

@@ -222,7 +222,7 @@ class ValidationRollouts(Callback):
         if shown:
             truth = self._video[shown].to(pl_module.device) / 255
             actions = self._actions[shown].to(pl_module.device)
-            steps = min(pl_module.averaged.model.sampling_steps, MAX_ROLLOUT_STEPS)
+            steps = min(pl_module.averaged.objective.steps or 1, MAX_ROLLOUT_STEPS)
             model = pl_module.averaged
             known = model.context_frames
             given = truth[:, :known]

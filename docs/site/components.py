@@ -19,12 +19,12 @@ IN_RECIPES = {
     "codec": "codec",
     "model": "model",
     "conditioner": "conditioner",
+    "objective": "objective",
 }
 """Kinds of components in a recipe, and their sections."""
 
 _ENTRY = re.compile(r"^( +)\**([\w, ]+?)(?: \([^)]*\))?: (.*(?:\n\1 +.*)*)", re.M)
 _WORDS = {
-    "flow": "How a denoiser learns and is sampled.",
     "trainer": "Flags of Lightning's `Trainer`.",
 }
 _EVERY_WORLD = ("size", "render_mode")

@@ -15,7 +15,7 @@ from torch.nn import functional
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.model.build import build_world_model
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import Predictor
 from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import compose
 
@@ -24,12 +24,14 @@ torch.manual_seed(0)
 # %% [markdown]
 # ## The model
 #
-# A model only has to implement `loss` and `predict`. `conditioning.modulation` holds one vector per
-# latent frame: the actions that lead to it, embedded by the conditioner that the recipe names.
+# A model that predicts without noise is a `Predictor` and only has to implement `forward`.
+# `conditioning.modulation` holds one vector per latent frame: the actions that lead to it, embedded
+# by the conditioner that the recipe names. How it learns is up to an objective: the one it is
+# registered with, unless a recipe chooses another.
 
 
 # %%
-class NextFrame(DynamicsModel):
+class NextFrame(Predictor):
     """Adds a change to each latent frame."""
 
     layers, heads, causal = 0, 1, True
@@ -41,23 +43,17 @@ class NextFrame(DynamicsModel):
         self.mix = nn.Conv2d(width, width, 3, padding=1)
         self.out = nn.Conv2d(width, latent_channels, 3, padding=1)
 
-    def forward(self, latent, modulation):
+    def next(self, latent, modulation):
         """Compute the next latent frame, `[B, C, h, w]`."""
         hidden = functional.silu(self.read(latent) + modulation[:, :, None, None])
         return latent + self.out(functional.silu(self.mix(hidden)))
 
-    def predict(self, given, conditioning, frames, generators, steps=None):
-        """Predict the clip that begins with the given frames, `[B, L, C, h, w]`."""
-        clip = list(given.unbind(1))
-        while len(clip) < frames:
-            clip.append(self(clip[-1], conditioning.modulation[:, len(clip)]))
-        return torch.stack(clip, 1)
-
-    def loss(self, latents, conditioning, generators):
-        """Mean squared error of the frames after the given ones."""
-        known, frames = self.given_frames, latents.shape[1]
-        predicted = self.predict(latents[:, :known], conditioning, frames, generators)
-        return functional.mse_loss(predicted[:, known:], latents[:, known:])
+    def forward(self, given, conditioning, frames):
+        """Predict the latent frames of a clip after the given ones, `[B, L − K, C, h, w]`."""
+        clip = [given[:, -1]]
+        for frame in range(given.shape[1], frames):
+            clip.append(self.next(clip[-1], conditioning.modulation[:, frame]))
+        return torch.stack(clip[1:], 1)
 
 
 class Plugin:
@@ -66,7 +62,8 @@ class Plugin:
     @staticmethod
     @hookimpl
     def register_models(registry):
-        registry.add("next_frame", f"{__name__}:NextFrame", summary="no noise")
+        target = f"{__name__}:NextFrame"
+        registry.add("next_frame", target, summary="no noise", objective="regression")
 
 
 catalog().add_plugin(Plugin(), "next_frame")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.shapes import Actions
 from acwm_dit.actions import Embedding, action_embedder
@@ -16,6 +18,7 @@ class AdaLN(Conditioner):
         width: model width D.
         layers: layers of the model; not used, as AdaLN adds no layers of its own.
         heads: attention heads of the model; not used.
+        widths: widths of layers that differ; not used.
         embedding: ``"stacked"``, or the published ``"convolutional"``.
     """
 
@@ -29,6 +32,7 @@ class AdaLN(Conditioner):
         width: int,
         layers: int,
         heads: int,
+        widths: Sequence[int] | None = None,
         embedding: Embedding = "stacked",
     ) -> None:
         super().__init__()

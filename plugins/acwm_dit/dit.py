@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.dynamics import Cache
+from acwm_core.model.dynamics import Cache, Denoiser, InputKind
 from acwm_core.model.shapes import Latent, Modulation, Sigmas
 from acwm_dit.attention import spatial_rotation, temporal_rotation
 from acwm_dit.blocks import FinalLayer, Layer
@@ -40,8 +40,8 @@ class DiT(Denoiser):
         patch_size: side of a patch in latent pixels.
         causal: whether a latent frame sees only itself and earlier ones. With None, the recipe's
             objective decides; outside of a recipe the model is then not causal.
-        previous: whether the model also gets, for each latent frame, the frame before it and that
-            frame's noise level, as `flow.objective=next_frame` needs. None works as for `causal`.
+        inputs: further latents, whose patches are added to those of the noisy ones, and levels,
+            which are embedded like the noise level. None works as for `causal`.
 
     Raises:
         RecipeError: a size below 1, or heads that do not divide the width into multiples of 4.
@@ -56,7 +56,7 @@ class DiT(Denoiser):
         heads: int = 2,
         patch_size: int = 2,
         causal: bool | None = None,
-        previous: bool | None = None,
+        inputs: Mapping[str, InputKind] | None = None,
     ) -> None:
         super().__init__()
         if min(width, layers, heads, patch_size) < 1:
@@ -72,24 +72,26 @@ class DiT(Denoiser):
         self.heads = heads
         self.patch_size = patch_size
         self.causal = bool(causal)
-        self.previous = bool(previous)
+        self.inputs = dict(inputs or {})
         patch_values = latent_channels * patch_size**2
         self.patch_embedding = Linear(patch_values, width)
-        self.timestep_embedding = _timestep_embedding(width)
-        if self.previous:
-            self.previous_embedding = Linear(patch_values, width)
-            self.previous_timestep_embedding = _timestep_embedding(width)
+        self.timestep_embedding = _embedding(width)
+        for name, kind in self.inputs.items():
+            embedding = Linear(patch_values, width) if kind == "latent" else _embedding(width)
+            self.add_module(_module_of(name), embedding)
         self.blocks = nn.ModuleList(Layer(width, heads, causal=self.causal) for _ in range(layers))
         self.final = FinalLayer(width, patch_values)
         self._initialise()
 
-    def forward(self, latents: Latent, sigma: Sigmas, conditioning: Conditioning) -> Latent:
+    def forward(
+        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, **inputs: Tensor
+    ) -> Latent:
         """Evaluate the model; see `Denoiser.forward`.
 
         Raises:
             ShapeError: the channels are not the codec's, or the sides do not divide into patches.
         """
-        return self._evaluate(latents, sigma, conditioning, None)
+        return self._evaluate(latents, sigma, conditioning, inputs, None)
 
     def new_cache(self, context: int) -> Cache:
         """A cache of the keys and values of temporal attention; see `Denoiser.new_cache`.
@@ -102,22 +104,24 @@ class DiT(Denoiser):
         return TemporalCache(self.layers, context)
 
     def extend(
-        self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, cache: Cache
+        self,
+        latents: Latent,
+        sigma: Sigmas,
+        conditioning: Conditioning,
+        cache: Cache,
+        **inputs: Tensor,
     ) -> Latent:
-        """Evaluate the frames that follow those in `cache`; see `Denoiser.extend`.
-
-        Raises:
-            ShapeError: see `forward`.
-        """
+        """Evaluate the frames that follow those in `cache`; see `Denoiser.extend`."""
         assert isinstance(cache, TemporalCache)
         cache.expect(latents.shape[1], latents.device)
-        return self._evaluate(latents, sigma, conditioning, cache)
+        return self._evaluate(latents, sigma, conditioning, inputs, cache)
 
     def _evaluate(
         self,
         latents: Latent,
         sigma: Sigmas,
         conditioning: Conditioning,
+        inputs: Mapping[str, Tensor],
         cache: TemporalCache | None,
     ) -> Latent:
         self._check(latents, sigma)
@@ -125,11 +129,11 @@ class DiT(Denoiser):
         size, device = self.width // self.heads, latents.device
         space = spatial_rotation(rows, columns, size, device)
         time = temporal_rotation(frames, size, device, cache.frames if cache else 0)
-        condition = self._condition(sigma, conditioning, latents.dtype)
+        condition = self._condition(sigma, conditioning, inputs, latents.dtype)
         # Under autocast the projection is bfloat16, but the residual stream stays in float32.
         tokens = self.patch_embedding(self._fold(latents)).to(latents.dtype)
-        if conditioning.previous is not None and self.previous:
-            tokens = tokens + self.previous_embedding(self._fold(conditioning.previous))
+        for name in self._named("latent"):
+            tokens = tokens + self.get_submodule(_module_of(name))(self._fold(inputs[name]))
         tokens = conditioning.inject_input(tokens)
         for index, block in enumerate(self.blocks):
             past = cache.layers[index] if cache else None
@@ -138,16 +142,23 @@ class DiT(Denoiser):
         return self._unfold(self.final(tokens, condition), rows, columns).to(latents.dtype)
 
     def _condition(
-        self, sigma: Sigmas, conditioning: Conditioning, dtype: torch.dtype
+        self,
+        sigma: Sigmas,
+        conditioning: Conditioning,
+        inputs: Mapping[str, Tensor],
+        dtype: torch.dtype,
     ) -> Modulation:
         """The condition of all blocks, `[B, L, D]`, with its SiLU already applied."""
         embedding = self.timestep_embedding(sinusoids(sigma * TIMESTEPS).to(dtype))
         if conditioning.modulation is not None:
             embedding = embedding + conditioning.modulation
-        if conditioning.previous_sigma is not None and self.previous:
-            levels = sinusoids(conditioning.previous_sigma * TIMESTEPS).to(dtype)
-            embedding = embedding + self.previous_timestep_embedding(levels)
+        for name in self._named("level"):
+            level = sinusoids(inputs[name] * TIMESTEPS).to(dtype)
+            embedding = embedding + self.get_submodule(_module_of(name))(level)
         return nn.functional.silu(embedding)
+
+    def _named(self, kind: InputKind) -> list[str]:
+        return [name for name, each in self.inputs.items() if each == kind]
 
     def _grid(self, latents: Latent) -> tuple[int, int, int]:
         _, frames, _, height, width = latents.shape
@@ -184,14 +195,20 @@ class DiT(Denoiser):
                 nn.init.xavier_uniform_(module.weight)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
+        levels = tuple(f"{_module_of(name)}." for name in ["sigma", *self._named("level")])
         for name, parameter in self.named_parameters():
-            if "timestep_embedding." in name and name.endswith(".weight"):
+            if name.startswith(levels) and name.endswith(".weight"):
                 nn.init.normal_(parameter, std=0.02)
             elif "modulation." in name or name.startswith("final."):
                 nn.init.zeros_(parameter)
 
 
-def _timestep_embedding(width: int) -> nn.Sequential:
+def _module_of(name: str) -> str:
+    """The module that embeds an input; the published weights call a noise level a timestep."""
+    return f"{name.replace('sigma', 'timestep')}_embedding"
+
+
+def _embedding(width: int) -> nn.Sequential:
     return nn.Sequential(Linear(FREQUENCIES, width), nn.SiLU(), Linear(width, width))
 
 

@@ -246,7 +246,7 @@ class ModelRollouts:
         rows = continued(rows, -rows.shape[1] % stride)
         length = 1 + rows.shape[1] // stride
         most = world.codec.latent_frames(world.clip_frames)
-        if length > most and not world.model.streams_by_default:
+        if length > most and not world.objective.streams_by_default(world.model):
             fitting = (most - 1) * stride - taken.shape[1]
             advice = f"plan at most {fitting} actions (planner.horizon · planner.action_block)"
             raise RecipeError(
@@ -258,7 +258,9 @@ class ModelRollouts:
         conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
-        return world.model.predict(given, conditioning, length, generators, self._steps)
+        return world.objective.predict(
+            world.model, given, conditioning, length, generators, self._steps
+        )
 
     def _known(self, given: Latent, taken: Tensor) -> int:
         """Number of video frames from the first given one to the current one."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError, noting
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
 
@@ -76,7 +75,7 @@ class Dream:
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
         with noting("when the model begins", *self._world.children()):
             self._stream = self._world.stream(video, between, steps=self._steps)
-            if isinstance(self._world.model, Denoiser):
+            if self._world.objective.steps:
                 self._others = self._world.stream(
                     video.expand(SAMPLES - 1, -1, -1, -1, -1),
                     None if between is None else between.expand(SAMPLES - 1, -1, -1),

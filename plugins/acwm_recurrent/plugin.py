@@ -10,4 +10,5 @@ def register_models(registry: Registry) -> None:
         "recurrent",
         "acwm_recurrent.recurrent:RecurrentModel",
         summary="1 M parameters: predicts the next latent frame at once, without noise",
+        objective="regression",
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,7 +10,7 @@ from torch.nn import functional
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import DynamicsModel, LatentStream
+from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.model.shapes import Latent
 from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
 
@@ -33,15 +32,13 @@ class State(NamedTuple):
     base: Tensor
 
 
-class RecurrentModel(DynamicsModel):
+class RecurrentModel(Predictor):
     """Unrolls a state from the given latent frame, one step per latent frame.
 
     The state has two parts. The grid has the same cells as the latent; the coordinates of the cells
     are among its inputs. The vector is updated by a GRU from the embedded actions and the pooled
     grid. Residual convolution blocks, modulated by the vector, update the grid. A predicted frame
-    is the given frame plus what a last convolution reads from the grid. The loss is the mean
-    squared error of the latents, with gradients through the whole clip. The model therefore
-    predicts means: what cannot be known becomes blurred.
+    is the given frame plus what a last convolution reads from the grid.
 
     With several given frames it starts from the last one and from the change just before it, which
     shows velocities.
@@ -57,7 +54,7 @@ class RecurrentModel(DynamicsModel):
     """
 
     layers, heads = 0, 1
-    causal = streams_by_default = True
+    causal = streams = True
 
     def __init__(
         self, *, latent_channels: int, channels: int = 64, width: int = 192, blocks: int = 2
@@ -94,33 +91,7 @@ class RecurrentModel(DynamicsModel):
         changes = self._read(torch.stack(grids, 1).flatten(0, 1)).unflatten(0, (len(given), -1))
         return state.base[:, None] + changes
 
-    def loss(
-        self, latents: Latent, conditioning: Conditioning, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """Mean squared error of the latents after the given ones."""
-        known, frames = self.given_frames, latents.shape[1]
-        predicted = self(latents[:, :known], conditioning, frames)
-        return functional.mse_loss(predicted.float(), latents[:, known:].float())
-
-    def predict(
-        self,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
-    ) -> Latent:
-        """Unroll the state over the clip. It is deterministic and takes a single pass."""
-        return torch.cat([given, self(given, conditioning, frames).to(given)], 1)
-
-    def stream(
-        self,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        *,
-        steps: int | None = None,
-        context: int,
-    ) -> LatentStream:
+    def stream(self, given: Latent, *, context: int) -> LatentStream:
         """Stream from the state. `context` is ignored, as the state holds all that is known."""
         return _RecurrentStream(self, given)
 

@@ -27,7 +27,7 @@ def import_checkpoint(
       env=push_cube                   meaning of the actions: an environment,
       data.path=data/mine             or a dataset
       codec.weights=FILE              weights of the codec
-      flow.objective=full_sequence    if not trained by diffusion forcing
+      objective=full_sequence         if not trained by diffusion forcing
       model.heads=8                   if not known from the weights
 
     `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` accept the run.

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import CheckpointError, PluginError
-from acwm_core.model.build import build_conditioner, build_model
+from acwm_core.model.build import build_conditioner, build_model, build_objective
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
-from acwm_core.model.flow import Flow
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 
@@ -105,7 +104,7 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
         PluginError: the importer's state dicts do not fit the model and conditioner.
     """
     with torch.device("meta"):
-        model = build_model(recipe.model, Flow(**recipe.flow), found.latent_channels)
+        model = build_model(recipe.model, build_objective(recipe.objective), found.latent_channels)
         conditioner = build_conditioner(
             recipe.conditioner, model, found.action_size, found.temporal_stride
         )

@@ -31,8 +31,8 @@ WAN = ("encoder.", "decoder.", "conv1.", "conv2.")
 
 TRAINED_WITH: Mapping[str, Any] = {
     "codec": {"name": "wan"},
-    "flow": {
-        "objective": "diffusion_forcing",
+    "objective": {
+        "name": "diffusion_forcing",
         "shift": 5.0,
         "prediction": "velocity",
         "loss_on": "velocity",

@@ -13,9 +13,9 @@ SIGNATURES = {
     "ClipDataset": "(episodes, *, frames=37, stride=4, indices=None, temporal_stride=None, "
     "given=1, per_length=1)",
     "EpisodeDataset": "(path, split)",
-    "Recipe": "(env, codec, model, conditioner, flow, training, data, evaluation, trainer)",
-    "WorldModel": "(codec, model, conditioner, action_low, action_high, *, clip_frames=37, "
-    "context_frames=1)",
+    "Recipe": "(env, codec, model, conditioner, objective, training, data, evaluation, trainer)",
+    "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
+    "clip_frames=37, context_frames=1)",
     "build_world_model": "(recipe, card)",
     "compose": "(recipe, overrides=())",
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",

@@ -11,8 +11,9 @@ from acwm_core.checks.conditioner import ConditionerChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.flow import Flow
+from acwm_core.model.dynamics import Denoiser
+from acwm_core.model.objectives.full_sequence import FullSequence
+from acwm_core.model.objectives.regression import Regression
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
 from tests.checks.toys import AtTheInput, OneWidth
@@ -52,15 +53,16 @@ def test_any_conditioner_drives_any_model(model, conditioner):
     with torch.no_grad():
         for parameter in [*network.parameters(), *embed.parameters()]:
             parameter.add_(torch.randn_like(parameter), alpha=0.05)
-        if isinstance(network, Denoiser):
-            network.flow = Flow(prediction="clean", steps=2)
+        denoises = isinstance(network, Denoiser)
+        objective = FullSequence(prediction="clean", steps=2) if denoises else Regression()
         given, embedded = torch.randn(1, 1, 4, 8, 8), [embed(torch.rand(1, 9, 2)) for _ in range(2)]
         if not network.layers and embedded[0].modulation is None:
             with pytest.raises(RecipeError, match="set conditioner="):
-                network.predict(given, embedded[0], 3, [])
+                objective.predict(network, given, embedded[0], 3, [])
             return
         one, other = (
-            network.predict(given, each, 3, [torch.Generator().manual_seed(0)]) for each in embedded
+            objective.predict(network, given, each, 3, [torch.Generator().manual_seed(0)])
+            for each in embedded
         )
     assert one.shape == (1, 3, 4, 8, 8)
     assert not torch.allclose(one[:, 1:], other[:, 1:])
@@ -100,7 +102,7 @@ class DropsTokensAtTheInput(AdaLN):
         return tokens[:, :, :-1]
 
 
-@FLAWS.caught_by("fits layers of different widths", "does not take `widths`")
+@FLAWS.caught_by("fits layers of different widths", "unexpected keyword argument 'widths'")
 class KnowsOneWidth(OneWidth):
     pass
 

@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from acwm_core.checks import check_model
-from acwm_core.checks.dynamics import DynamicsChecks, Probe
-from acwm_core.checks.model import DenoiserChecks
+from acwm_core.checks.model import DenoiserChecks, DynamicsChecks, Probe
 from acwm_core.checks.result import checks_of
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, Predictor
+from acwm_core.model.objectives.next_frame import NextFrame
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
@@ -39,9 +39,9 @@ def test_installed_models_conform(part):
     assert failures(check_model(part.name, **smaller)) == {}
 
 
-@pytest.mark.parametrize("previous", [False, True], ids=["diffusion_forcing", "next_frame"])
-def test_a_causal_model_conforms(previous):
-    assert failures(check_model(DiT, **SMALL, causal=True, previous=previous)) == {}
+@pytest.mark.parametrize("inputs", [{}, NextFrame.inputs], ids=["none", "next_frame"])
+def test_a_causal_model_conforms(inputs):
+    assert failures(check_model(DiT, **SMALL, causal=True, inputs=inputs)) == {}
 
 
 class Flawed(DiT):
@@ -196,13 +196,16 @@ class CountsALayerTooMany(Flawed):
         self.layers = 3
 
 
-@FLAWS.caught_by("sees the frame before if it says so", "ignores the latents of the one before")
+@FLAWS.caught_by("sees its further inputs", "ignores the frame's input previous")
 class Forgetful(DiT):
     def __init__(self, *, latent_channels):
-        super().__init__(latent_channels=latent_channels, **SMALL, causal=True, previous=True)
+        super().__init__(
+            latent_channels=latent_channels, **SMALL, causal=True, inputs=NextFrame.inputs
+        )
 
-    def forward(self, latents, sigma, conditioning):
-        return super().forward(latents, sigma, replace(conditioning, previous=None))
+    def forward(self, latents, sigma, conditioning, *, previous, previous_sigma):
+        inputs = {"previous": latents, "previous_sigma": previous_sigma}
+        return super().forward(latents, sigma, conditioning, **inputs)
 
 
 class Causal(DiT):
@@ -231,6 +234,14 @@ class KeepsUnasked(Causal):
         predicted = super().extend(latents, sigma, conditioning, cache)
         cache.keep(1)
         return predicted
+
+
+@FLAWS.caught_by("can be constructed", "neither a Denoiser nor a Predictor")
+class OfNoKind(DynamicsModel):
+    width, layers, heads = 8, 0, 1
+
+    def __init__(self, *, latent_channels):
+        super().__init__()
 
 
 class Recurrent(RecurrentModel):
@@ -265,10 +276,10 @@ class NamesCopies(Recurrent):
         return [nn.Parameter(each * 1) for each in super().matrices()]
 
 
-@FLAWS.caught_by("keeps the given frames", "come out changed")
-class PredictsTheGiven(Recurrent):
-    def predict(self, given, conditioning, frames, generators, steps=None):
-        return super().predict(given, conditioning, frames, generators, steps) + 1
+@FLAWS.caught_by("keeps the given frames", "forward gives the shape [2, 2, 4, 8, 8], not")
+class LosesTheLastFrame(Recurrent):
+    def forward(self, given, conditioning, frames):
+        return super().forward(given, conditioning, frames)[:, :-1]
 
 
 @FLAWS.caught_by("elements of a batch are independent", "rest of the batch")
@@ -298,11 +309,11 @@ class ForgetsItsState(Recurrent):
 
 @FLAWS.caught_by("streams what it predicts", "refuses to stream")
 class OnlySaysThatItStreams(Recurrent):
-    def stream(self, given, generators, *, steps=None, context):
-        return DynamicsModel.stream(self, given, generators, steps=steps, context=context)
+    def stream(self, given, *, context):
+        return Predictor.stream(self, given, context=context)
 
 
 @FLAWS.caught_by("streams what it predicts", "after 2 given frames")
 class StreamsFromTheFirst(Recurrent):
-    def stream(self, given, generators, *, steps=None, context):
-        return super().stream(given[:, :1], generators, steps=steps, context=context)
+    def stream(self, given, *, context):
+        return super().stream(given[:, :1], context=context)

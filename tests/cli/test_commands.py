@@ -109,7 +109,7 @@ NEEDY = """
 
 
 def test_show_prints_a_recipe_that_stands_on_its_own(tmp_path: Path) -> None:
-    result = run("show", "push_cube_small", "conditioner=cross_attention", "flow.steps=7")
+    result = run("show", "push_cube_small", "conditioner=cross_attention", "objective.steps=7")
     assert result.exit_code == 0
     shown = yaml.safe_load(result.output)
     assert shown["conditioner"]["name"] == "cross_attention"

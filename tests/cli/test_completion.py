@@ -55,6 +55,11 @@ def test_keys_come_with_their_values():
     [
         ("fit push_cube_small", "conditioner=c", ["conditioner=cross_attention"]),
         ("fit push_cube_small conditioner =", "c", ["cross_attention"]),  # as bash splits it
+        (
+            "fit push_cube_small objective =",
+            "",
+            ["diffusion_forcing", "full_sequence", "next_frame", "regression"],
+        ),
         ("fit push_cube_small data.clip_starts", "", ["anywhere", "episode"]),
         ("fit push_cube_small", "training.compile=t", ["training.compile=true"]),
         ("fit push_cube_small", "training.nonsuch=", []),

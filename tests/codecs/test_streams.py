@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from acwm_core.checks.trial import shaken
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
@@ -32,8 +32,9 @@ def test_a_stream_shows_what_its_latents_decode_to(name, request):
     conditioner = catalog().create(
         "conditioner", "adaln", action_size=2, temporal_stride=stride, **FIT
     )
-    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=1)
-    world = WorldModel(codec, shaken(model), conditioner, [-1.0, -1.0], [1.0, 1.0]).eval()
+    objective = DiffusionForcing(prediction="clean", steps=1)
+    parts = codec, shaken(model), conditioner, objective
+    world = WorldModel(*parts, [-1.0, -1.0], [1.0, 1.0]).eval()
     first = torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(0))
     stream = world.stream(first, context=3)
     frames, latents = [stream.first[:, None]], [stream._latents._unkept]

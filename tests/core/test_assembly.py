@@ -44,7 +44,7 @@ def build(*words):
     return build_world_model(compose("push_cube_small", ["codec=identity", *words]), CARD)
 
 
-WHOLE, FORCING = "flow.objective=full_sequence", "flow.objective=diffusion_forcing"
+WHOLE, FORCING = "objective=full_sequence", "objective=diffusion_forcing"
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_forcing_a_model_that_is_not_causal_is_refused(words):
 
 def test_an_unknown_objective_is_refused():
     with pytest.raises(RecipeError, match="did you mean 'diffusion_forcing'"):
-        compose("push_cube_small", ["flow.objective=difusion_forcing"])
+        compose("push_cube_small", ["objective=difusion_forcing"])

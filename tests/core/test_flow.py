@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from acwm_core.errors import RecipeError
-from acwm_core.model.flow import TRAINING_POINTS, Flow, gaussian_weights, mix, shifted_schedule
+from acwm_core.model.objectives.flow import (
+    TRAINING_POINTS,
+    gaussian_weights,
+    mix,
+    shifted_schedule,
+)
+from acwm_core.model.objectives.full_sequence import FullSequence
 
 PUBLISHED = json.loads((Path(__file__).parents[1] / "reference/flow_schedule.json").read_text())
 
@@ -35,7 +41,7 @@ def test_conversions_invert_the_path(prediction):
     clean, noise = latents(0), latents(1)
     sigma = torch.rand(3, 4, generator=torch.Generator().manual_seed(2)) * 0.9 + 0.05
     noisy = mix(clean, noise, sigma)
-    flow = Flow(prediction=prediction)
+    flow = FullSequence(prediction=prediction)
     perfect = clean if prediction == "clean" else noise - clean
     torch.testing.assert_close(flow.to_clean(perfect, noisy, sigma), clean, atol=1e-4, rtol=1e-4)
     velocity = flow.to_velocity(perfect, noisy, sigma)
@@ -53,7 +59,7 @@ def test_sampling_with_an_exact_denoiser_is_exact(prediction, steps):
         assert torch.equal(noisy[:, 0], clean[:, 0])
         return clean if prediction == "clean" else noise - clean
 
-    out = Flow(prediction=prediction, shift=20).sample(exact, noise, clean[:, :1], steps)
+    out = FullSequence(prediction=prediction, shift=20).sample(exact, noise, clean[:, :1], steps)
     torch.testing.assert_close(out, clean, atol=1e-5, rtol=1e-5)
 
 
@@ -62,7 +68,7 @@ def test_sampling_with_an_exact_denoiser_is_exact(prediction, steps):
 def test_loss_of_a_zero_prediction_is_the_variance_of_its_target(prediction, loss_on):
     """Predicting 0 in the space of the loss leaves E|target|²: 1 for unit data, 2 for ε − x."""
     clean = latents(0, batch=512, frames=5)
-    flow = Flow(prediction=prediction, loss_on=loss_on, weighting="none", shift=1)
+    flow = FullSequence(prediction=prediction, loss_on=loss_on, weighting="none", shift=1)
 
     def zero_in_loss_space(noisy, sigma):
         level = sigma[:, :, None, None, None]
@@ -70,14 +76,14 @@ def test_loss_of_a_zero_prediction_is_the_variance_of_its_target(prediction, los
             return torch.zeros_like(noisy)
         return noisy if loss_on == "velocity" else noisy / level.clamp(min=1e-6)
 
-    loss = flow.loss(zero_in_loss_space, clean, [torch.Generator().manual_seed(3)] * 512)
+    loss = flow.error(zero_in_loss_space, clean, [torch.Generator().manual_seed(3)] * 512)
     assert loss.item() == pytest.approx(2.0 if loss_on == "velocity" else 1.0, rel=0.05)
 
 
 @pytest.mark.parametrize("known", [1, 2, 3])
 def test_given_frames_are_clean_and_carry_no_loss(known):
     clean = latents(0)
-    flow = Flow(prediction="clean", loss_on="clean")
+    flow = FullSequence(prediction="clean", loss_on="clean")
 
     def wrong_in_what_is_given(noisy, sigma):
         assert torch.equal(noisy[:, :known], clean[:, :known])
@@ -86,19 +92,19 @@ def test_given_frames_are_clean_and_carry_no_loss(known):
         return torch.cat([clean[:, :known] + 100, clean[:, known:]], dim=1)
 
     generators = [torch.Generator().manual_seed(seed) for seed in range(3)]
-    assert flow.loss(wrong_in_what_is_given, clean, generators, known).item() == 0
+    assert flow.error(wrong_in_what_is_given, clean, generators, known).item() == 0
 
     def wrong_after_it(noisy, sigma):
         return clean + 1
 
-    assert flow.loss(wrong_after_it, clean, generators, known).item() > 0
+    assert flow.error(wrong_after_it, clean, generators, known).item() > 0
 
 
 def test_same_generator_same_loss():
     clean = latents(0)
-    flow = Flow(prediction="clean", loss_on="clean")
+    flow = FullSequence(prediction="clean", loss_on="clean")
     losses = [
-        flow.loss(lambda noisy, _: noisy, clean, [torch.Generator().manual_seed(s)] * 3).item()
+        flow.error(lambda noisy, _: noisy, clean, [torch.Generator().manual_seed(s)] * 3).item()
         for s in (5, 5, 6)
     ]
     assert losses[0] == losses[1] != losses[2]
@@ -110,5 +116,5 @@ def test_higher_shift_trains_on_more_noise():
 
 @pytest.mark.parametrize("bad", [{"shift": 0.0}, {"steps": 0}])
 def test_impossible_parameters_are_refused(bad):
-    with pytest.raises(RecipeError, match=r"flow\."):
-        Flow(**bad)
+    with pytest.raises(RecipeError, match=r"objective\."):
+        FullSequence(**bad)

@@ -1,22 +1,20 @@
-"""`flow.objective=next_frame`: one pass over a clip is what sampling frame by frame does."""
+"""`objective=next_frame`: one pass over a clip is what sampling frame by frame does."""
 
 import pytest
 import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError
-from acwm_core.model import next_frame
 from acwm_core.model.build import build_model
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.dynamics import Cache
-from acwm_core.model.flow import Flow
+from acwm_core.model.dynamics import Cache, Denoiser
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.next_frame import NextFrame, frames_before
 from acwm_core.recipe import ComponentConfig
 from acwm_dit.dit import DiT
 
 DECAY = 0.8
 FLOW = {
-    "objective": "next_frame",
     "prediction": "clean",
     "loss_on": "clean",
     "weighting": "none",
@@ -40,12 +38,16 @@ def normal(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def dit(**flow):
+def next_frame(**params):
+    return NextFrame(**{**FLOW, **params})
+
+
+def dit():
     torch.manual_seed(0)
-    model = DiT(latent_channels=4, width=32, layers=2, heads=2, causal=True, previous=True)
+    sizes = {"latent_channels": 4, "width": 32, "layers": 2, "heads": 2}
+    model = DiT(**sizes, causal=True, inputs=NextFrame.inputs)
     for parameter in model.parameters():
         nn.init.normal_(parameter, std=0.15)
-    model.flow = Flow(**{**FLOW, **flow})
     return model.eval()
 
 
@@ -61,23 +63,22 @@ class NoCache(Cache):
 class Scaled(Denoiser):
     """Predicts that a frame is `factor` times the one before, and keeps what it was shown."""
 
-    width, layers, heads, causal, previous = 1, 0, 1, True, True
+    width, layers, heads, causal, inputs = 1, 0, 1, True, NextFrame.inputs
 
-    def __init__(self, factor=1.0, **flow):
+    def __init__(self, factor=1.0):
         super().__init__()
         self.factor = nn.Parameter(torch.tensor(factor))
-        self.flow = Flow(**{**FLOW, **flow})
         self.shown = []
 
-    def forward(self, latents, sigma, conditioning):
-        self.shown.append(conditioning)
-        return (self.factor - 1) * conditioning.previous
+    def forward(self, latents, sigma, conditioning, *, previous, previous_sigma):
+        self.shown.append(previous)
+        return (self.factor - 1) * previous
 
     def new_cache(self, context):
         return NoCache(context)
 
-    def extend(self, latents, sigma, conditioning, cache):
-        return (self.factor - 1) * conditioning.previous
+    def extend(self, latents, sigma, conditioning, cache, *, previous, previous_sigma):
+        return (self.factor - 1) * previous
 
 
 def decaying(clips, frames=5):
@@ -92,14 +93,14 @@ def decaying(clips, frames=5):
 @pytest.mark.parametrize("noise", [0.0, 0.6])
 def test_the_loss_is_least_at_the_best_guess_from_the_noised_frame_before(noise):
     """E[z'·p] / E[p²] of p = (1 − σ) z + σ ε with σ uniform in [0, noise]."""
-    model, clips = Scaled(past_noise=noise), 3000
+    model, objective, clips = Scaled(), next_frame(past_noise=noise), 3000
     signal = 1 - noise / 2
     power = 1 - noise + 2 * noise**2 / 3
     best = DECAY * signal / power
     slopes = []
     for factor in (best, best - 0.1, best + 0.1):
         model.factor.data.fill_(factor)
-        loss = model.loss(decaying(clips), conditioning(clips, 5), draws(clips))
+        loss = objective.loss(model, decaying(clips), conditioning(clips, 5), draws(clips), 1)
         slopes.append(torch.autograd.grad(loss, model.factor)[0].item())
     assert abs(slopes[0]) < 0.015
     assert slopes[1] < -0.1
@@ -110,7 +111,7 @@ def test_the_loss_is_least_at_the_best_guess_from_the_noised_frame_before(noise)
 def test_one_pass_over_a_clip_equals_sampling_it_frame_by_frame(known):
     model, given = dit(), normal(2, known, 4, 8, 8, seed=1)
     with torch.no_grad():
-        clip = model.predict(given, conditioning(), 6, draws(2))
+        clip = next_frame().predict(model, given, conditioning(), 6, draws(2))
         generators = draws(2)
         later = [
             torch.stack([torch.randn(4, 8, 8, generator=g) for g in generators])
@@ -119,8 +120,8 @@ def test_one_pass_over_a_clip_equals_sampling_it_frame_by_frame(known):
         noisy = torch.cat([given, torch.stack(later, 1)], 1)
         sigma = torch.ones(2, 6)
         sigma[:, :known] = 0
-        after = next_frame._after(next_frame._before(clip), conditioning())
-        whole = after.previous + model(noisy, sigma, after)
+        past = {"previous": frames_before(clip), "previous_sigma": torch.zeros(2, 6)}
+        whole = frames_before(clip) + model(noisy, sigma, conditioning(), **past)
     torch.testing.assert_close(clip[:, :known], given)
     torch.testing.assert_close(clip[:, known:], whole[:, known:], rtol=0, atol=1e-5)
     assert (clip[:, known:] - clip[:, known - 1 : known]).abs().mean() > 0.1
@@ -128,59 +129,58 @@ def test_one_pass_over_a_clip_equals_sampling_it_frame_by_frame(known):
 
 def test_nothing_of_a_frame_itself_is_seen():
     """At noise level 1 a frame's prediction depends on frames before it alone."""
-    model, latents = dit(past_noise=0.0, shift=1e9), normal(2, 6, 4, 8, 8, seed=1)
-    seen = []
-    model.flow.loss = lambda denoise, clean, *_: seen.append(
-        denoise(normal(2, 6, 4, 8, 8, seed=2), torch.ones(2, 6))
+    model, objective, seen = dit(), next_frame(past_noise=0.0, shift=1e9), []
+    latents = normal(2, 6, 4, 8, 8, seed=1)
+    objective.error = lambda evaluate, clean, *_: seen.append(
+        evaluate(normal(2, 6, 4, 8, 8, seed=2), torch.ones(2, 6))
     )
     changed = latents.clone()
     changed[:, 3:] += 1
     with torch.no_grad():
         for clip in (latents, changed):
-            next_frame.loss(model, clip, conditioning(), draws(2))
+            objective.loss(model, clip, conditioning(), draws(2), 1)
     first, second = seen
     torch.testing.assert_close(first[:, :4], second[:, :4])
     assert (first[:, 4:] - second[:, 4:]).abs().mean() > 0.1
 
 
 def test_own_past_shows_its_rollout_to_that_share_of_the_clips():
-    model, clips = Scaled(0.5, past_noise=0.0, own_past=0.25), 400
-    latents = decaying(clips)
-    model.loss(latents, conditioning(clips, 5), draws(clips))
+    model, clips = Scaled(0.5), 400
+    latents, objective = decaying(clips), next_frame(past_noise=0.0, own_past=0.25)
+    objective.loss(model, latents, conditioning(clips, 5), draws(clips), 1)
     (told,) = model.shown
     rollout = latents[:, :1] * 0.5 ** torch.arange(5)[:, None, None, None]
-    own = (told.previous - next_frame._before(rollout)).abs().amax((1, 2, 3, 4)) < 1e-5
-    true = (told.previous - next_frame._before(latents)).abs().amax((1, 2, 3, 4)) < 1e-5
+    own = (told - frames_before(rollout)).abs().amax((1, 2, 3, 4)) < 1e-5
+    true = (told - frames_before(latents)).abs().amax((1, 2, 3, 4)) < 1e-5
     assert torch.all(own ^ true)
     assert 70 < own.sum() < 130  # three and a half standard deviations about 100
 
 
 def test_a_clip_draws_the_same_beside_any_others():
-    model, latents = Scaled(own_past=0.5), decaying(3)
-    model.loss(latents, conditioning(3, 5), draws(3))
-    model.loss(latents[1:], conditioning(2, 5), draws(2, seed=1))
+    model, objective, latents = Scaled(), next_frame(own_past=0.5), decaying(3)
+    objective.loss(model, latents, conditioning(3, 5), draws(3), 1)
+    objective.loss(model, latents[1:], conditioning(2, 5), draws(2, seed=1), 1)
     both, alone = model.shown
-    assert torch.equal(both.previous[1:], alone.previous)
+    assert torch.equal(both[1:], alone)
 
 
 def test_a_recipe_sets_what_the_objective_needs():
-    choice = ComponentConfig("dit_xs", {"causal": None, "previous": None})
-    model = build_model(choice, Flow(**FLOW), 4)
-    assert (model.causal, model.previous, model.streams_by_default) == (True, True, True)
-    model = build_model(choice, Flow(objective="diffusion_forcing"), 4)
-    assert (model.causal, model.previous, model.streams_by_default) == (True, False, False)
-    with pytest.raises(RecipeError, match=r"takes the previous frame as input.*diffusion_forcing"):
-        build_model(ComponentConfig("dit_xs", {"previous": False}), Flow(**FLOW), 4)
+    choice = ComponentConfig("dit_xs", {"causal": None, "inputs": None})
+    model = build_model(choice, next_frame(), 4)
+    assert (model.causal, model.inputs) == (True, NextFrame.inputs)
+    model = build_model(choice, DiffusionForcing(), 4)
+    assert (model.causal, model.inputs) == (True, {})
+    with pytest.raises(RecipeError, match=r"further inputs previous, previous_sigma.*diffusion_"):
+        build_model(ComponentConfig("dit_xs", {"inputs": {}}), next_frame(), 4)
 
 
 @pytest.mark.parametrize(
-    ("flow", "message"),
+    ("params", "message"),
     [
-        ({"own_past": 0.5}, r"own_past needs flow.objective=next_frame"),
         ({"past_noise": 1.5}, r"past_noise=1.5 must be between 0 and 1"),
-        ({"objective": "next_frame", "own_past": float("nan")}, r"own_past=nan must be"),
+        ({"own_past": float("nan")}, r"own_past=nan must be"),
     ],
 )
-def test_values_out_of_range_are_refused(flow, message):
+def test_values_out_of_range_are_refused(params, message):
     with pytest.raises(RecipeError, match=message):
-        Flow(**flow)
+        NextFrame(**params)

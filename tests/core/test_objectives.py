@@ -7,10 +7,12 @@ linear function `exact_velocity`, and its flow takes the noise ε to m + s ε.
 import pytest
 import torch
 
-from acwm_core.model.flow import TRAINING_POINTS, Flow, gaussian_weights, shifted_schedule
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.flow import TRAINING_POINTS, gaussian_weights, shifted_schedule
+from acwm_core.model.objectives.full_sequence import FullSequence
 
 MEAN, SPREAD = 0.7, 0.4
-OBJECTIVES = ["full_sequence", "diffusion_forcing"]
+OBJECTIVES = [FullSequence, DiffusionForcing]
 
 
 def per_frame(sigma):
@@ -57,13 +59,13 @@ class Recorder:
 @pytest.mark.parametrize("weighting", ["gaussian", "none"])
 def test_the_loss_is_least_at_the_exact_velocity(objective, weighting):
     """There its gradient vanishes, and what is left is the velocity's own uncertainty."""
-    flow = Flow(objective=objective, weighting=weighting, shift=3)
+    flow = objective(weighting=weighting, shift=3)
     scale, offset = torch.ones(1, requires_grad=True), torch.zeros(1, requires_grad=True)
 
     def denoise(noisy, sigma):
         return scale * exact_velocity(noisy, sigma) + offset
 
-    loss = flow.loss(denoise, clean(6000), draws(6000, 0))
+    loss = flow.error(denoise, clean(6000), draws(6000, 0))
     at_least = torch.autograd.grad(loss, (scale, offset))
     assert all(abs(gradient.item()) < 0.02 for gradient in at_least)
 
@@ -76,7 +78,7 @@ def test_the_loss_is_least_at_the_exact_velocity(objective, weighting):
 
     for wrong in (0.8, 1.2):
         scale.data.fill_(wrong)
-        worse = flow.loss(denoise, clean(6000), draws(6000, 0))
+        worse = flow.error(denoise, clean(6000), draws(6000, 0))
         (slope,) = torch.autograd.grad(worse, scale)
         assert worse > loss
         assert slope * (wrong - 1) > 0.01
@@ -86,12 +88,12 @@ def test_one_level_per_clip_or_one_per_frame():
     levels = {}
     for objective in OBJECTIVES:
         recorder = Recorder()
-        flow = Flow(objective=objective, shift=1)
-        flow.loss(recorder, clean(4000), draws(4000, 0))
+        flow = objective(shift=1)
+        flow.error(recorder, clean(4000), draws(4000, 0))
         (sigma,) = recorder.sigmas
         assert torch.all(sigma[:, 0] == 0)
         levels[objective] = sigma[:, 1:]
-    whole, each = levels["full_sequence"], levels["diffusion_forcing"]
+    whole, each = levels[FullSequence], levels[DiffusionForcing]
     assert torch.equal(whole, whole[:, :1].expand_as(whole))
     assert torch.corrcoef(each.T).triu(1).abs().max() < 0.06  # four standard errors of 4000 draws
     for drawn in (whole, each):  # uniform at shift 1
@@ -103,7 +105,7 @@ def test_one_level_per_clip_or_one_per_frame():
 
 def test_every_frame_is_weighed_by_its_own_level():
     """An error of one frame alone counts with that frame's weight."""
-    flow = Flow(objective="diffusion_forcing")
+    flow = DiffusionForcing()
     target, recorder = clean(1), Recorder()
     sigmas = shifted_schedule(TRAINING_POINTS, 5.0)
     weights = gaussian_weights(sigmas)
@@ -115,7 +117,7 @@ def test_every_frame_is_weighed_by_its_own_level():
             return exact
 
         recorder = Recorder(wrong_by_one)
-        loss = flow.loss(recorder, target, draws(1, 7))
+        loss = flow.error(recorder, target, draws(1, 7))
         level = recorder.sigmas[0][0, frame].double()
         index = (sigmas - level).abs().argmin()
         assert loss.item() == pytest.approx(weights[index].item() / 3, rel=1e-3)
@@ -123,7 +125,7 @@ def test_every_frame_is_weighed_by_its_own_level():
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_a_clip_draws_the_same_beside_any_others(objective):
-    flow, target = Flow(objective=objective), clean(3)
+    flow, target = objective(), clean(3)
     seen = []
 
     def keep(noisy, sigma):
@@ -133,8 +135,8 @@ def test_a_clip_draws_the_same_beside_any_others(objective):
     def generators(*seeds):
         return [torch.Generator().manual_seed(seed) for seed in seeds]
 
-    flow.loss(keep, target, generators(1, 2, 3))
-    flow.loss(keep, target[1:], generators(2, 3))
+    flow.error(keep, target, generators(1, 2, 3))
+    flow.error(keep, target[1:], generators(2, 3))
     assert all(torch.equal(both[1:], alone) for both, alone in zip(*seen, strict=True))
 
 
@@ -142,7 +144,7 @@ def test_a_clip_draws_the_same_beside_any_others(objective):
 def test_sampling_converges_to_the_exact_flow(prediction):
     """Euler is of first order: twice the steps, half the error."""
     start, given = noise(8, 4, 2, 4, 4), clean(8)[:, :1]
-    flow = Flow(prediction=prediction, shift=3)
+    flow = FullSequence(prediction=prediction, shift=3)
     denoise = exact_velocity if prediction == "velocity" else exact_clean
     exact = MEAN + SPREAD * start[:, 1:]
     errors = []
@@ -157,7 +159,7 @@ def test_sampling_converges_to_the_exact_flow(prediction):
 
 def test_the_default_is_the_published_number_of_evaluations():
     recorder = Recorder()
-    Flow().sample(recorder, noise(2, 3, 2, 4, 4), clean(2, 1))
+    FullSequence().sample(recorder, noise(2, 3, 2, 4, 4), clean(2, 1))
     levels = torch.stack([sigma[0, 1] for sigma in recorder.sigmas])
     assert len(levels) == 49
     torch.testing.assert_close(levels, shifted_schedule(50, 5.0)[:-1].float())
@@ -167,7 +169,7 @@ def test_the_default_is_the_published_number_of_evaluations():
 def test_any_number_of_frames_may_be_given(known):
     start, given = noise(2, 4, 2, 4, 4), clean(2)[:, :known]
     recorder = Recorder()
-    sampled = Flow().sample(recorder, start, given, steps=3)
+    sampled = FullSequence().sample(recorder, start, given, steps=3)
     assert torch.equal(sampled[:, :known], given)
     assert all(torch.all(sigma[:, :known] == 0) for sigma in recorder.sigmas)
     assert all(torch.all(sigma[:, known:] > 0) for sigma in recorder.sigmas)

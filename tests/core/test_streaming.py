@@ -8,7 +8,8 @@ from acwm_core.errors import ActionError, RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Cache
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
 from tests.core.tiny import MeanCodec, PointwiseModel, SumConditioner
 
@@ -58,13 +59,13 @@ class RecentConditioner(Conditioner):
         return Conditioning(self.embed(recent), None, self)
 
 
-def small_world(objective="diffusion_forcing", **parts):
+def small_world(objective=DiffusionForcing, **parts):
     torch.manual_seed(0)
     codec = parts.get("codec", FrameCodec())
     model = parts.get("model", CausalModel(latent_channels=codec.channels))
     conditioner = parts.get("conditioner", RecentConditioner(action_size=2, width=model.width))
-    model.flow = Flow(objective=objective, prediction="clean", steps=3)
-    return WorldModel(codec, model, conditioner, [-2.0, -2.0], [2.0, 2.0])
+    how = objective(prediction="clean", steps=3)
+    return WorldModel(codec, model, conditioner, how, [-2.0, -2.0], [2.0, 2.0])
 
 
 def first_frame(batch=2):
@@ -120,7 +121,7 @@ def test_a_conditioner_gets_as_much_of_the_past_as_it_says():
     for latent_frame in range(1, 9):
         noise = torch.stack([torch.randn((3, 2, 2), generator=g) for g in generators])[:, None]
         own = conditioning.frames(latent_frame, latent_frame + 1)
-        latents = world.model.flow.sample(
+        latents = world.objective.sample(
             lambda noisy, sigma, own=own: world.model(noisy, sigma, own), noise, noise[:, :0]
         )
         expected = world.codec.decode(latents.repeat(1, 2, 1, 1, 1))[:, 1:]
@@ -177,8 +178,8 @@ def test_parts_that_cannot_be_streamed_are_refused_with_what_to_do():
 
     sums = SumConditioner(action_size=2, temporal_stride=4, width=8, layers=1, heads=1)
     for parts, reason in (
-        ({"model": PointwiseModel(latent_channels=3)}, "later frames.*diffusion_forcing"),
-        ({"objective": "full_sequence"}, "cannot be streamed.*diffusion_forcing"),
+        ({"model": PointwiseModel(latent_channels=3)}, "PointwiseModel has no cache"),
+        ({"objective": FullSequence}, "cannot be streamed.*diffusion_forcing"),
         ({"conditioner": sums}, "SumConditioner embeds all actions"),
         ({"model": NoCache(latent_channels=3)}, "NoCache has no cache of earlier frames"),
         ({"codec": RemembersAll()}, "RemembersAll"),

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
 from tests.core.tiny import MeanCodec, tiny_world_model
 
@@ -68,9 +70,9 @@ def test_a_single_frame_may_have_an_axis_of_time():
 
 def test_a_model_learns_what_follows_the_frames_that_it_is_given():
     world = tiny_world_model()
-    parts = world.codec, world.model, world.conditioner, [-2.0, -2.0], [2.0, 2.0]
+    components = world.codec, world.model, world.conditioner, world.objective
+    parts = *components, [-2.0, -2.0], [2.0, 2.0]
     world = WorldModel(*parts, clip_frames=13, context_frames=5)
-    assert world.model.given_frames == 2
     latents = world.encode(torch.rand(2, 13, 3, 16, 16))
     changed = latents.clone()
     changed[:, 1] += 1  # the pointwise model predicts each frame by itself
@@ -88,7 +90,8 @@ def test_a_model_learns_what_follows_the_frames_that_it_is_given():
 @pytest.mark.parametrize(("clip_frames", "context_frames"), [(13, 2), (13, 4), (13, 13), (13, 0)])
 def test_given_frames_must_make_whole_latent_frames_and_leave_some(clip_frames, context_frames):
     world = tiny_world_model()
-    parts = world.codec, world.model, world.conditioner, [-2.0, -2.0], [2.0, 2.0]
+    components = world.codec, world.model, world.conditioner, world.objective
+    parts = *components, [-2.0, -2.0], [2.0, 2.0]
     with pytest.raises(RecipeError, match=rf"data\.context_frames={context_frames} must be 1 plus"):
         WorldModel(*parts, clip_frames=clip_frames, context_frames=context_frames)
 
@@ -123,7 +126,7 @@ def test_loss_reaches_model_and_conditioner_but_not_the_codec():
     assert all(not p.requires_grad for p in world.codec.parameters())
 
 
-@pytest.mark.parametrize("objective", ["full_sequence", "diffusion_forcing"])
+@pytest.mark.parametrize("objective", [FullSequence, DiffusionForcing])
 def test_a_short_training_learns_what_actions_do(objective):
     """Blocks brighten with the summed action; after training, true actions beat swapped ones."""
     settings = {"prediction": "clean", "loss_on": "clean", "weighting": "none", "shift": 20}

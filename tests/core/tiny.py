@@ -5,8 +5,8 @@ from torch import nn
 
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.flow import Flow
+from acwm_core.model.dynamics import Denoiser
+from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
 
 
@@ -63,7 +63,7 @@ class SumConditioner(Conditioner):
         return Conditioning(self.embed(so_far[:, :: self.stride]), None, self)
 
 
-def tiny_world_model(seed=0, actions=2, **flow):
+def tiny_world_model(seed=0, actions=2, objective=FullSequence, **flow):
     torch.manual_seed(seed)
     codec = MeanCodec()
     model = PointwiseModel(latent_channels=codec.channels)
@@ -71,5 +71,4 @@ def tiny_world_model(seed=0, actions=2, **flow):
         action_size=actions, temporal_stride=4, width=model.width, layers=1, heads=1
     )
     bounds = [-2.0] * actions, [2.0] * actions
-    model.flow = Flow(**{"steps": 3, **flow})
-    return WorldModel(codec, model, conditioner, *bounds)
+    return WorldModel(codec, model, conditioner, objective(**{"steps": 3, **flow}), *bounds)

@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_dit import blocks
@@ -27,8 +27,8 @@ def small_world(conditioner="adaln", stride=4, seed=0, **params):
     for part in (model, embedder):
         for parameter in part.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=2)
-    return WorldModel(codec, model, embedder, [-1.0, 0.0], [1.0, 4.0]).eval()
+    objective = DiffusionForcing(prediction="clean", steps=2)
+    return WorldModel(codec, model, embedder, objective, [-1.0, 0.0], [1.0, 4.0]).eval()
 
 
 def beginning(batch=2, given=1):
@@ -63,7 +63,7 @@ def computed_anew(world, rows, context=CONTEXT, given=1):
             with band:
                 return world.model(everything, levels, conditioning)[:, -1:]
 
-        new = world.model.flow.sample(denoise, noise[:, None], done[:, :0])
+        new = world.objective.sample(denoise, noise[:, None], done[:, :0])
         done = torch.cat([done, new], 1)
     return world.codec.decode(done)
 

@@ -13,7 +13,6 @@ def make_run(folder, data):
         "codec": {"name": "identity"},
         "model": {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1},
         "conditioner": {"name": "adaln"},
-        "flow": {},
         "data": {"path": str(data), "clip_frames": 13},
     }
     return evaluation.make_run(folder, data, parts=parts)

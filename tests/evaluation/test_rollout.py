@@ -100,7 +100,7 @@ def causal_run(data, tmp_path_factory):
         "codec": {"name": "identity", "temporal_stride": 2},
         "model": {"name": "dit_xs", "width": 16, "layers": 2},
         "conditioner": {"name": "adaln"},
-        "flow": {"objective": "diffusion_forcing", "prediction": "clean", "steps": 2},
+        "objective": {"name": "diffusion_forcing", "prediction": "clean", "steps": 2},
     }
     return tiny.make_run(tmp_path_factory.mktemp("runs") / "causal", data, parts=parts)
 

@@ -15,7 +15,7 @@ def test_the_lines_on_the_page_play(data, tmp_path):
         "codec": {"name": "identity"},
         "model": {"name": "dit_xs", "width": 16, "layers": 1},
         "conditioner": {"name": "adaln"},
-        "flow": {"objective": "diffusion_forcing", "prediction": "clean"},
+        "objective": {"name": "diffusion_forcing", "prediction": "clean"},
     }
     run = tiny.make_run(tmp_path / "run", data, parts=parts)
     lines, more = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)

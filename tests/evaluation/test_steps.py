@@ -52,7 +52,7 @@ def test_the_curve_is_that_of_an_independent_computation(evaluated, data, split)
 def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):
     rows = [r for r in read_results(evaluated) if r.kind == "model" and r.split == "ind_test"]
     point = Summary.read(evaluated).splits["ind_test"].steps.points[1]
-    assert point.steps == load_run(evaluated).world_model.model.sampling_steps
+    assert point.steps == load_run(evaluated).world_model.objective.steps
     expected = np.mean([row.values["mse"] for row in rows if row.episode < 3])
     assert point.scores["mse"].value == pytest.approx(expected, rel=1e-6)
 

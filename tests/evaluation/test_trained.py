@@ -16,8 +16,8 @@ RECIPE = {
     "codec": {"name": "identity", "spatial_stride": 4, "temporal_stride": 2},
     "model": {"name": "dit_xs", "width": 64, "layers": 2},
     "conditioner": {"name": "adaln"},
-    "flow": {
-        "objective": "diffusion_forcing",
+    "objective": {
+        "name": "diffusion_forcing",
         "shift": 20.0,
         "prediction": "clean",
         "loss_on": "clean",

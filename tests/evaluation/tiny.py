@@ -10,7 +10,7 @@ from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, 
 from acwm_core.env.episode import Factor
 from acwm_core.model.build import build_world_model
 from acwm_core.model.codec import Codec
-from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.dynamics import Denoiser
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import read_recipe, recipe_folder
@@ -139,7 +139,7 @@ def make_run(path, data, seed=0, parts=None, **evaluation):
             "codec": {"name": "blocks"},
             "model": {"name": "linear"},
             "conditioner": {"name": "linear"},
-            "flow": {"steps": 2, "prediction": "clean"},
+            "objective": {"steps": 2, "prediction": "clean"},
             "data": {"path": str(data), "clip_frames": 9},
             "evaluation": {**METRICS, "frames": 9, "device": "cpu", "steps_sweep": []} | evaluation,
             **(parts or {}),

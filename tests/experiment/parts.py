@@ -77,7 +77,7 @@ env: square
 codec: blocks
 model: {name: waiting, width: 4}
 conditioner: linear
-flow: {steps: 2, prediction: clean, loss_on: clean, weighting: none}
+objective: {steps: 2, prediction: clean, loss_on: clean, weighting: none}
 data: {path: data/square, clip_frames: 9, batch_size: 2, validation_episodes: 1}
 training:
   learning_rate: 1.0e-2

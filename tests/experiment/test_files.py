@@ -138,10 +138,10 @@ def test_two_recipes_of_one_name_are_told_apart(tmp_path):
 
 
 def test_recipes_beside_the_file_are_found_from_elsewhere(tmp_path):
-    (tmp_path / "mine.yaml").write_text("extends: push_cube\nflow: {shift: 2.0}\n")
+    (tmp_path / "mine.yaml").write_text("extends: push_cube\nobjective: {shift: 2.0}\n")
     made = plan(tmp_path, "rows: {all: mine}")
     assert made.runs[0].arguments[0] == str(tmp_path / "mine.yaml")
-    assert made.runs[0].recipe.flow["shift"] == 2.0
+    assert made.runs[0].recipe.objective.params["shift"] == 2.0
     assert made.experiment.title == "pushing"
 
 

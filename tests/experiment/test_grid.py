@@ -15,7 +15,7 @@ GRID = ("model.width=4,6", "training.learning_rate=1e-2,2e-2")
 
 
 def test_a_row_is_named_after_its_values():
-    file = read_grid("push_cube_small", ["model.layers=2,3", "+small", "flow.shift=2.0,3.0"])
+    file = read_grid("push_cube_small", ["model.layers=2,3", "+small", "objective.shift=2.0,3.0"])
     assert [cell.row for cell in file.experiment.cells] == [
         "layers=2, shift=2.0",
         "layers=2, shift=3.0",
@@ -23,7 +23,7 @@ def test_a_row_is_named_after_its_values():
         "layers=3, shift=3.0",
     ]
     assert file.overrides == ("+small",)
-    assert file.experiment.cells[1].overrides == ("model.layers=2", "flow.shift=3.0")
+    assert file.experiment.cells[1].overrides == ("model.layers=2", "objective.shift=3.0")
 
 
 def test_a_list_is_one_value_and_names_that_clash_are_whole():

@@ -93,8 +93,13 @@ def test_a_training_counts_by_its_weights_and_recipe(made):
     shorter = replace(run.recipe, trainer={"max_steps": 3})
     with pytest.raises(TrainingError, match=r"trainer\.max_steps was 7, is 3"):
         training_progress(replace(run, recipe=shorter))
-    other = replace(run.recipe, flow={**run.recipe.flow, "shift": 9.0})
-    with pytest.raises(TrainingError, match=r"flow\.shift was \S+, is 9\.0; choose anoth"):
+    other = replace(
+        run.recipe,
+        objective=replace(
+            run.recipe.objective, params={**run.recipe.objective.params, "shift": 9.0}
+        ),
+    )
+    with pytest.raises(TrainingError, match=r"objective\.shift was \S+, is 9\.0; choose anoth"):
         training_progress(replace(run, recipe=other))
 
 

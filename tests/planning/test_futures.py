@@ -119,8 +119,8 @@ def test_candidates_differ_by_their_actions_alone(bundle, history):
 def test_the_gradient_of_a_sampled_future_is_its_slope(tmp_path, history, objective):
     """Through all sampling steps and, with `next_frame`, through the frames before."""
     model = {"name": "dit_xs", "width": 16, "layers": 2}
-    flow = {"objective": objective, "prediction": "clean", "steps": 3}
-    parts = {"model": model, "conditioner": {"name": "adaln"}, "flow": flow}
+    objective = {"name": objective, "prediction": "clean", "steps": 3}
+    parts = {"model": model, "conditioner": {"name": "adaln"}, "objective": objective}
     bundle = load_run(tiny.make_run(tmp_path, parts=parts))
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
 
@@ -140,19 +140,19 @@ def test_the_gradient_of_a_sampled_future_is_its_slope(tmp_path, history, object
 
 def test_a_prediction_that_is_not_finite_costs_nan_whatever_the_cost_says(bundle, history):
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
-    predict = bundle.world_model.model.predict
+    predict = bundle.world_model.objective.predict
 
     def broken(*args, **options):
         latents = predict(*args, **options).clone()
         latents[1, -1, 0, 0, 0] = math.inf
         return latents
 
-    bundle.world_model.model.predict = broken
+    bundle.world_model.objective.predict = broken
     try:
         cost = rollouts.cost(history, STILL, lambda f, t, g: torch.zeros(3), None, None, 0)
         found = cost(candidates(3, 4))
     finally:
-        del bundle.world_model.model.predict
+        del bundle.world_model.objective.predict
     assert found.isnan().tolist() == [False, True, False]
 
 

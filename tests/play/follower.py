@@ -11,7 +11,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import resolve_size
 from acwm_core.model.build import build_world_model
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import DynamicsModel, LatentStream
+from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import save_weights
@@ -26,23 +26,20 @@ REACH = 0.388
 RADIUS = 4
 
 
-class Follower(DynamicsModel):
+class Follower(Predictor):
     width, layers, heads = 2 * STRIDE, 0, 1
-    causal = streams_by_default = True
+    causal = streams = True
 
     def __init__(self, *, latent_channels: int):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
-    def loss(self, latents, conditioning, generators):
-        return self.unused.sum()
-
-    def predict(self, given, conditioning, frames, generators, steps=None):
+    def forward(self, given, conditioning, frames):
         stream = _FollowerStream(given)
         more = [stream.advance(conditioning.frames(k - 1, k + 1)) for k in range(1, frames)]
-        return torch.cat([given, *more], 1)
+        return torch.cat(more, 1)
 
-    def stream(self, given, generators, *, steps=None, context):
+    def stream(self, given, *, context):
         return _FollowerStream(given)
 
 
@@ -104,6 +101,7 @@ def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
             "codec": {"name": "identity"},
             "model": model or {"name": "follower"},
             "conditioner": {"name": conditioner},
+            **({} if model else {"objective": {"name": "regression"}}),
             "data": {"path": "data/none", "clip_frames": 9},
             "evaluation": METRICS,
         }

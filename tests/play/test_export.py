@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.errors import AcwmError, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels
+from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_play.export import episodes, graphs, page, runtime
@@ -46,7 +47,7 @@ def recurrent_world(given=1):
         **about,
     )
     bounds = [-1.0, -2.0], [1.0, 2.0]
-    world = WorldModel(codec, model, conditioner, *bounds, context_frames=given)
+    world = WorldModel(codec, model, conditioner, Regression(), *bounds, context_frames=given)
     follower.disturb(world)
     return world
 

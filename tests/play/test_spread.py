@@ -8,7 +8,8 @@ import torch
 
 from acwm_core.checks.trial import shaken
 from acwm_core.evaluation.videos import to_pixels
-from acwm_core.model.flow import Flow
+from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_play import dream
@@ -26,13 +27,15 @@ CARD = SimpleNamespace(
 
 
 def world_of(model, codec):
-    model.flow = Flow(objective="diffusion_forcing", prediction="clean", steps=1)
+    follows = isinstance(model, follower.Follower)
+    objective = Regression() if follows else DiffusionForcing(prediction="clean", steps=1)
     about = {"width": model.width, "layers": model.layers, "heads": model.heads}
-    kind = "raw" if isinstance(model, follower.Follower) else "adaln"
+    kind = "raw" if follows else "adaln"
     conditioner = catalog().create(
         "conditioner", kind, action_size=2, temporal_stride=codec.temporal_stride, **about
     )
-    return WorldModel(codec, shaken(model), conditioner, [-1.0] * 2, [1.0] * 2).eval()
+    parts = codec, shaken(model), conditioner, objective
+    return WorldModel(*parts, [-1.0] * 2, [1.0] * 2).eval()
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from torch import nn
 from acwm_core.data.card import DatasetCard
 from acwm_core.model.build import build_world_model
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import DynamicsModel, LatentStream
+from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import save_weights
@@ -37,26 +37,23 @@ def corners_of(frames):
     return torch.stack([best // sums.shape[2], best % sums.shape[2]], 1).float()
 
 
-class Exact(DynamicsModel):
+class Exact(Predictor):
     """Slides the square as the simulator does, from where it is seen, to half a pixel."""
 
     width, layers, heads = 2 * STRIDE, 0, 1
-    causal = streams_by_default = True
+    causal = streams = True
     blind = False
 
     def __init__(self, *, latent_channels: int):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
-    def loss(self, latents, conditioning, generators):
-        return self.unused.sum()
-
-    def predict(self, given, conditioning, frames, generators, steps=None):
+    def forward(self, given, conditioning, frames):
         stream = ExactStream(given, self.blind)
         more = [stream.advance(conditioning.frames(k - 1, k + 1)) for k in range(1, frames)]
-        return torch.cat([given, *more], 1)
+        return torch.cat(more, 1)
 
-    def stream(self, given, generators, *, steps=None, context):
+    def stream(self, given, *, context):
         return ExactStream(given, self.blind)
 
 
@@ -127,6 +124,7 @@ def make_run(folder, model="exact", environment="slide", **data):
             "codec": {"name": "identity"},
             "model": {"name": model},
             "conditioner": {"name": "slide_raw"},
+            "objective": {"name": "regression"},
             "data": {"path": "data/none", "clip_frames": 13, **data},
             "evaluation": METRICS,
         }

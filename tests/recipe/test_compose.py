@@ -11,9 +11,9 @@ from acwm_core.recipe.compose import merge, parse_override, read_recipe
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     files = {
-        "root.yaml": "codec: {name: compact, weights: a}\nflow: {shift: 5, steps: 3}\n",
-        "parts/model.yaml": "model: dit_s\nflow: {steps: 4}\n",
-        "own.yaml": "extends: [root.yaml, parts/model.yaml]\nflow: {prediction: clean}\n",
+        "root.yaml": "codec: {name: compact, weights: a}\nobjective: {shift: 5, steps: 3}\n",
+        "parts/model.yaml": "model: dit_s\nobjective: {steps: 4}\n",
+        "own.yaml": "extends: [root.yaml, parts/model.yaml]\nobjective: {prediction: clean}\n",
     }
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -25,7 +25,7 @@ def test_extends_are_merged_deeply_and_in_order(folder: Path) -> None:
     assert read_recipe(folder / "own.yaml") == {
         "codec": {"name": "compact", "weights": "a"},
         "model": {"name": "dit_s"},
-        "flow": {"shift": 5, "steps": 4, "prediction": "clean"},
+        "objective": {"shift": 5, "steps": 4, "prediction": "clean"},
     }
 
 
@@ -61,21 +61,21 @@ def test_words_do_not_depend_on_their_order(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("flow.shift=1e-4", 1e-4),
-        ("flow.shift=-2.5E+3", -2500.0),
-        ("flow.shift=.5e1", 5.0),
-        ("flow.shift=5", 5),
-        ("flow.shift=null", None),
-        ("flow.shift=[1, 2]", [1, 2]),
-        ("flow.shift={a: 1}", {"a": 1}),
-        ("flow.shift=2024-01-01", "2024-01-01"),
-        ("flow.shift=a=b", "a=b"),
-        ("flow.shift='1e-4'", "1e-4"),
-        ("flow.shift=", None),
+        ("objective.shift=1e-4", 1e-4),
+        ("objective.shift=-2.5E+3", -2500.0),
+        ("objective.shift=.5e1", 5.0),
+        ("objective.shift=5", 5),
+        ("objective.shift=null", None),
+        ("objective.shift=[1, 2]", [1, 2]),
+        ("objective.shift={a: 1}", {"a": 1}),
+        ("objective.shift=2024-01-01", "2024-01-01"),
+        ("objective.shift=a=b", "a=b"),
+        ("objective.shift='1e-4'", "1e-4"),
+        ("objective.shift=", None),
     ],
 )
 def test_values_of_words_are_yaml(word: str, expected: object) -> None:
-    assert parse_override(word) == {"flow": {"shift": expected}}
+    assert parse_override(word) == {"objective": {"shift": expected}}
 
 
 def test_a_part_may_be_written_out_in_a_word() -> None:
@@ -92,7 +92,7 @@ def test_malformed_words_are_refused(word: str) -> None:
     with pytest.raises(RecipeError, match="is not an override"):
         parse_override(word)
     with pytest.raises(RecipeError, match="not valid YAML"):
-        parse_override("flow.shift=[1")
+        parse_override("objective.shift=[1")
 
 
 def test_circles_are_refused(folder: Path) -> None:
@@ -120,11 +120,11 @@ def overlaid(folder: Path) -> Path:
         "tiny": "replace:\n"
         "  model: {dit_s: {name: dit_xs, layers: 1}, dit_m: dit_s}\n"
         "  codec: {wan: compact}\n"
-        "  flow.prediction: {clean: velocity}\n"
+        "  objective.prediction: {clean: velocity}\n"
         "  data.path: {x: y}\n"
-        "flow: {steps: 1}\n",
-        "slow": "extends: [quick_part.yaml]\nflow: {shift: 9}\n",
-        "quick_part": "flow: {steps: 2}\n",
+        "objective: {steps: 1}\n",
+        "slow": "extends: [quick_part.yaml]\nobjective: {shift: 9}\n",
+        "quick_part": "objective: {steps: 2}\n",
     }
     for name, text in files.items():
         (folder / "overlays" / f"{name}.yaml").write_text(text)
@@ -135,22 +135,22 @@ def test_overlays_replace_what_they_list_and_lay_the_rest_over(overlaid: Path) -
     assert read_recipe(overlaid / "own.yaml", ["+tiny"]) == {
         "codec": {"name": "compact", "weights": "a"},  # not listed
         "model": {"name": "dit_xs", "layers": 1},
-        "flow": {"shift": 5, "steps": 1, "prediction": "velocity"},
+        "objective": {"shift": 5, "steps": 1, "prediction": "velocity"},
     }
 
 
 def test_overlays_come_in_order_and_words_over_them(overlaid: Path) -> None:
     own = overlaid / "own.yaml"
-    assert read_recipe(own, ["+tiny", "+slow"])["flow"]["steps"] == 2
-    assert read_recipe(own, ["+slow", "+tiny"])["flow"] == {
+    assert read_recipe(own, ["+tiny", "+slow"])["objective"]["steps"] == 2
+    assert read_recipe(own, ["+slow", "+tiny"])["objective"] == {
         "shift": 9,
         "steps": 1,
         "prediction": "velocity",
     }
-    words = ["flow.steps=7", "model=dit_m", "+tiny"]
+    words = ["objective.steps=7", "model=dit_m", "+tiny"]
     changed = read_recipe(own, words)
     assert changed == read_recipe(own, words[::-1])
-    assert (changed["flow"]["steps"], changed["model"]) == (7, {"name": "dit_m"})
+    assert (changed["objective"]["steps"], changed["model"]) == (7, {"name": "dit_m"})
 
 
 def test_a_recipe_may_extend_an_overlay(overlaid: Path) -> None:
@@ -169,9 +169,9 @@ def test_unknown_overlays_name_the_nearest(overlaid: Path) -> None:
 
 
 def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None:
-    (overlaid / "odd.yaml").write_text("flow:\ncodec: [1]\ndata: text\nmodel: {layers: 3}\n")
+    (overlaid / "odd.yaml").write_text("objective:\ncodec: [1]\ndata: text\nmodel: {layers: 3}\n")
     odd = read_recipe(overlaid / "odd.yaml", ["+tiny"])
-    assert (odd["model"], odd["data"], odd["flow"]) == ({"layers": 3}, "text", {"steps": 1})
+    assert (odd["model"], odd["data"], odd["objective"]) == ({"layers": 3}, "text", {"steps": 1})
 
 
 @pytest.mark.parametrize(
@@ -181,9 +181,9 @@ def test_overlays_meet_recipes_without_what_they_replace(overlaid: Path) -> None
         ("replace: {model: dit_s}\n", "must list replacements"),
         ("- a\n- b\n", "is not a recipe"),
         ("just text", "is not a recipe"),
-        ("flow: {shift: 5\n", "not valid YAML"),
+        ("objective: {shift: 5\n", "not valid YAML"),
         (f"seed: {'9' * 5000}\n", "not valid YAML"),  # more digits than Python reads
-        ("flow: {}\nmodel: dit_s\nflow: {}\n", "'flow' is given twice"),
+        ("objective: {}\nmodel: dit_s\nobjective: {}\n", "'objective' is given twice"),
         ("extends: {a: b}\n", "must be a list of recipe files"),
         ("extends: [3]\n", "must be a list of recipe files"),
     ],
@@ -201,6 +201,6 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_merging_changes_neither_side() -> None:
-    base, changes = {"flow": {"shift": 1}}, {"flow": {"steps": 2}}
-    assert merge(base, changes) == {"flow": {"shift": 1, "steps": 2}}
-    assert (base, changes) == ({"flow": {"shift": 1}}, {"flow": {"steps": 2}})
+    base, changes = {"objective": {"shift": 1}}, {"objective": {"steps": 2}}
+    assert merge(base, changes) == {"objective": {"shift": 1, "steps": 2}}
+    assert (base, changes) == ({"objective": {"shift": 1}}, {"objective": {"steps": 2}})

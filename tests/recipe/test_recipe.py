@@ -48,7 +48,7 @@ def test_every_default_is_written_out(recipe: Path) -> None:
             "heads": 12,
             "patch_size": 4,
             "causal": None,
-            "previous": None,
+            "inputs": None,
         },
     )
     assert composed.training["betas"] == (0.9, 0.95)
@@ -99,9 +99,9 @@ WRONG = {
     "codec=nowhere": "but tests.recipe.test_recipe has no 'Missing'",
     "codec=": "names no codec; add codec=NAME",
     "codec=[compact]": "names no codec",
-    "flow=5": "flow=5: give parameters, as in flow.parameter=value",
-    "flow.prediction=cleen": "expected 'velocity' or 'clean'; did you mean 'clean'?",
-    "flow.shift=high": "flow.shift=high: expected float",
+    "training=5": "training=5: give parameters, as in training.parameter=value",
+    "objective.prediction=cleen": "expected 'velocity' or 'clean'; did you mean 'clean'?",
+    "objective.shift=high": "objective.shift=high: expected float",
     "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
     "training.learning_rat=1": "did you mean 'learning_rate'?",
     "training.max_steps=10": "has no parameter 'max_steps'; did you mean trainer.max_steps?",

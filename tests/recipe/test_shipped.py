@@ -52,10 +52,11 @@ def test_these_are_all_of_them():
 @pytest.mark.parametrize("name", PAPER)
 def test_the_papers_experiments_share_its_setting(name):
     recipe = compose(name)
-    assert recipe.flow["objective"] == "full_sequence"
-    assert (recipe.flow["prediction"], recipe.flow["loss_on"]) == ("velocity", "velocity")
-    assert (recipe.flow["shift"], recipe.flow["weighting"]) == (5.0, "gaussian")
-    assert recipe.flow["steps"] == 49
+    assert recipe.objective.name == "full_sequence"
+    assert recipe.objective.params == {
+        **{"prediction": "velocity", "loss_on": "velocity"},
+        **{"shift": 5.0, "weighting": "gaussian", "steps": 49},
+    }
     assert recipe.training["learning_rate"] == 1e-4
     assert (recipe.training["schedule"], recipe.training["ema_decay"]) == ("constant", 0.0)
     assert (recipe.data["batch_size"], recipe.data["clip_frames"]) == (4, 37)

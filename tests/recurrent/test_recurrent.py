@@ -9,7 +9,8 @@ from torch.nn import functional
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import Predictor
+from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import DECODED_TOGETHER, WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.config import TrainingConfig
@@ -35,7 +36,7 @@ def world_of(model, stride=4):
         layers=model.layers,
         heads=model.heads,
     )
-    return WorldModel(codec, model, conditioner, *BOUNDS)
+    return WorldModel(codec, model, conditioner, Regression(), *BOUNDS)
 
 
 @pytest.fixture
@@ -106,8 +107,8 @@ def test_nothing_is_random(world):
 def test_a_fresh_model_repeats_the_given_frame():
     model = RecurrentModel(latent_channels=4)
     given = torch.randn(2, 1, 4, 8, 8)
-    predicted = model.predict(given, Conditioning(torch.zeros(2, 5, 192), None, None), 5, [])
-    torch.testing.assert_close(predicted, given.expand(-1, 5, -1, -1, -1))
+    predicted = model(given, Conditioning(torch.zeros(2, 5, 192), None, None), 5)
+    torch.testing.assert_close(predicted, given.expand(-1, 4, -1, -1, -1))
 
 
 def drifting(batch, seed):
@@ -124,14 +125,13 @@ def test_several_given_frames_show_velocities():
     for known in (1, 2):
         torch.manual_seed(0)
         model = RecurrentModel(latent_channels=1, channels=8, width=16, blocks=1)
-        model.given_frames = known
         optimizer = torch.optim.AdamW(model.parameters(), 1e-2)
         for step in range(200):
             optimizer.zero_grad()
-            model.loss(*drifting(32, step), []).backward()
+            Regression().loss(model, *drifting(32, step), [], known).backward()
             optimizer.step()
         with torch.no_grad():
-            errors[known] = model.loss(*drifting(256, 10_000), []).item()
+            errors[known] = Regression().loss(model, *drifting(256, 10_000), [], known).item()
     assert errors[1] > 8
     assert errors[2] < 1
 
@@ -142,9 +142,9 @@ def test_wrong_sizes_are_refused():
     model = RecurrentModel(latent_channels=4)
     bare = Conditioning(torch.zeros(1, 2, 192), None, None)
     with pytest.raises(ShapeError, match=r"latents \[B, L, 4, h, w\]"):
-        model.predict(torch.zeros(1, 1, 3, 8, 8), bare, 2, [])
+        model(torch.zeros(1, 1, 3, 8, 8), bare, 2)
     with pytest.raises(RecipeError, match="set conditioner=adaln"):
-        model.predict(torch.zeros(1, 1, 4, 8, 8), Conditioning(None, None, None), 2, [])
+        model(torch.zeros(1, 1, 4, 8, 8), Conditioning(None, None, None), 2)
 
 
 def moving_dots(batch, seed):
@@ -192,7 +192,7 @@ def test_muon_gets_the_convolutions_and_no_other_parameter_is_left_out(world):
     assert matrices == {id(c.weight) for c in convolutions}
 
 
-class Copier(DynamicsModel):
+class Copier(Predictor):
     """A third party's model without a single matrix: the last frame, plus a bias per action."""
 
     width, layers, heads, causal = 4, 0, 1, True
@@ -203,15 +203,8 @@ class Copier(DynamicsModel):
 
     def forward(self, given, conditioning, frames):
         push = conditioning.modulation[:, 1:frames].mean(-1).cumsum(1)[..., None, None, None]
-        return given[:, -1:] + push * (1 + self.bias[:, None, None])
-
-    def loss(self, latents, conditioning, generators):
-        return functional.mse_loss(
-            self(latents[:, :1], conditioning, latents.shape[1]), latents[:, 1:]
-        )
-
-    def predict(self, given, conditioning, frames, generators, steps=None):
-        return torch.cat([given, self(given, conditioning, frames)[:, given.shape[1] - 1 :]], 1)
+        clip = given[:, -1:] + push * (1 + self.bias[:, None, None])
+        return clip[:, given.shape[1] - 1 :]
 
 
 def test_a_model_of_a_third_party_needs_neither_noise_nor_matrices():

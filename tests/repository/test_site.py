@@ -142,7 +142,7 @@ def test_the_reference_lists_every_command_and_option(site):
 def test_the_reference_lists_every_key_of_a_recipe_and_every_component(site):
     keys = (site / "reference" / "recipe-keys.html").read_text(encoding="utf-8")
     recipe = compose("push_cube_small").to_dict()
-    sections = ("flow", "training", "data", "evaluation", "trainer")
+    sections = ("training", "data", "evaluation", "trainer")
     for name, _ in flat_items({section: recipe[section] for section in sections}):
         assert f"<code>{name}</code>" in keys, name
     components = (site / "reference" / "components.html").read_text(encoding="utf-8")

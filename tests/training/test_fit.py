@@ -114,7 +114,7 @@ def test_validation_predicts_held_out_clips(whole, data):
     clips = ClipDataset(EpisodeDataset(data, "train"), frames=9, stride=12, indices=[6, 7])
     video, actions = (torch.stack([clip[key] for clip in clips]) for key in ("video", "actions"))
     truth = video.float() / 255
-    predicted = world_model.rollout(truth[:, 0], actions, steps=world_model.model.sampling_steps)
+    predicted = world_model.rollout(truth[:, 0], actions, steps=world_model.objective.steps)
     psnr, still = as_torchmetric("psnr"), as_torchmetric("psnr")
     psnr.update(predicted, truth)
     still.update(truth[:, :1].expand_as(truth), truth)

@@ -62,9 +62,9 @@ def data_of(tmp_path_factory):
         *((name, () if name in SMALL else ("+small",)) for name in recipe_names()),
         ("push_cube_small", ("conditioner=cross_attention",)),
         ("push_cube_small", ("codec=identity",)),
-        ("push_cube_small", ("flow.objective=diffusion_forcing",)),
+        ("push_cube_small", ("objective=diffusion_forcing",)),
         ("push_cube", ("+small", "+recurrent")),
-        ("push_cube", ("+small", "+next_frame", "flow.own_past=0.5")),
+        ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )
 def test_two_real_steps(recipe, words, data_of, tmp_path):

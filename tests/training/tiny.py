@@ -14,8 +14,8 @@ from torch import nn
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.denoiser import Denoiser
-from acwm_core.model.flow import Flow
+from acwm_core.model.dynamics import Denoiser
+from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
 from acwm_core.training.optimizers import local
@@ -272,7 +272,7 @@ def tiny_recipe(data, /, **sections) -> Recipe:
             "window_stride": 2,
             "validation_episodes": 2,
         },
-        "flow": {"prediction": "clean", "loss_on": "clean", "weighting": "none", "steps": 2},
+        "objective": {"prediction": "clean", "loss_on": "clean", "weighting": "none", "steps": 2},
         "trainer": {"max_steps": 16, "accelerator": "cpu", "log_every_n_steps": 1},
     }
     parts = {"env": "world", "codec": "codec", "model": "model", "conditioner": "conditioner"}
@@ -290,6 +290,5 @@ def tiny_world_model(seed: int = 0, **params) -> WorldModel:
     conditioner = TinyConditioner(
         action_size=2, temporal_stride=2, width=model.width, layers=1, heads=1
     )
-    flow = Flow(prediction="clean", loss_on="clean", weighting="none", steps=2)
-    model.flow = flow
-    return WorldModel(codec, model, conditioner, (-1.0, -1.0), (1.0, 1.0))
+    objective = FullSequence(prediction="clean", loss_on="clean", weighting="none", steps=2)
+    return WorldModel(codec, model, conditioner, objective, (-1.0, -1.0), (1.0, 1.0))

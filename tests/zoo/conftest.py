@@ -22,7 +22,7 @@ def run(data, tmp_path_factory):
         "codec": {"name": "blocks"},
         "model": {"name": "linear"},
         "conditioner": {"name": "linear"},
-        "flow": {"steps": 2, "prediction": "clean"},
+        "objective": {"steps": 2, "prediction": "clean"},
         "data": {"path": str(data), "clip_frames": 9, "batch_size": 2, "validation_episodes": 2},
         "evaluation": {**tiny.METRICS, **QUICK, "metrics": ["mse", "psnr"], "device": "cpu"},
         "training": {"validate_every_n_steps": 2, "learning_rate": 1e-3},

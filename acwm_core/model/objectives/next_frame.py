@@ -1,0 +1,188 @@
+"""Next-frame flow matching: every latent frame is denoised after a clean past, in one pass.
+
+Besides its own noisy latent, the network gets the previous frame for each latent frame. In a model
+that is causal in time, a frame also sees the inputs of earlier frames, and so the whole clean past
+but nothing of its own clean latent. A pass over a clip then costs as much as with diffusion
+forcing; teacher forcing with clean and noisy copies of every frame costs twice that. Sampling goes
+frame by frame, with the same inputs as training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from acwm_core.errors import RecipeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import Cache, Denoiser, InputKind, LatentStream
+from acwm_core.model.objectives.flow import (
+    Evaluate,
+    FlowMatching,
+    drawn_noise,
+    evaluation,
+    mix,
+)
+from acwm_core.model.shapes import Latent, Sigmas
+
+
+class NextFrame(FlowMatching):
+    """Flow matching of each latent frame, to which the network sees the frame before it.
+
+    With `prediction=clean`, the network predicts the change from that frame, so an untrained model
+    copies it.
+
+    Args:
+        past_noise: the largest noise level of the previous frame. The level is drawn for every
+            frame and given to the network, so that it tolerates its own errors later.
+        own_past: the share of clips that are trained after the model's own rollout instead of the
+            true past (self-forcing, Huang et al. 2025, arXiv 2506.08009).
+        **flow: see `FlowMatching`.
+
+    Raises:
+        RecipeError: a value is out of its range.
+    """
+
+    causal = True
+    inputs: Mapping[str, InputKind] = {"previous": "latent", "previous_sigma": "level"}
+
+    def __init__(self, *, past_noise: float = 0.3, own_past: float = 0.0, **flow: Any) -> None:
+        super().__init__(**flow)
+        for name, share in (("past_noise", past_noise), ("own_past", own_past)):
+            if not 0 <= share <= 1:
+                raise RecipeError(f"objective.{name}={share} must be between 0 and 1")
+        self.past_noise = past_noise
+        self.own_past = own_past
+
+    def loss(
+        self,
+        model: Denoiser,
+        latents: Latent,
+        conditioning: Conditioning,
+        generators: Sequence[torch.Generator],
+        known: int,
+    ) -> Tensor:
+        """The error of one evaluation after a past that is clean, noisy or the model's own."""
+        past = self._past(model, latents, conditioning, generators, known)
+        levels = torch.stack([torch.rand(latents.shape[1], generator=g) for g in generators])
+        noise = drawn_noise(latents.shape[1:], generators).to(latents)
+        sigma = (levels * self.past_noise).to(latents)
+        previous = mix(frames_before(past), noise, sigma)
+        after = evaluation(model, conditioning, previous=previous, previous_sigma=sigma)
+        return self.error(self.from_change(after, previous), latents, generators, known)
+
+    def _past(
+        self,
+        model: Denoiser,
+        latents: Latent,
+        conditioning: Conditioning,
+        generators: Sequence[torch.Generator],
+        known: int,
+    ) -> Latent:
+        """The clips, of which a share of `own_past` is the model's own rollout in one step."""
+        if not self.own_past:
+            return latents
+        own = torch.stack([torch.rand((), generator=g) for g in generators]) < self.own_past
+        # Separate generators: whether there is a rollout depends on other clips of the batch.
+        seeds = [int(torch.randint(2**62, (), generator=g)) for g in generators]
+        if not own.any():
+            return latents
+        noises = [torch.Generator().manual_seed(seed) for seed in seeds]
+        given, frames = latents[:, :known], latents.shape[1]
+        with torch.no_grad():
+            rollout = self.predict(model, given, conditioning, frames, noises, steps=1)
+        return torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
+
+    def predict(
+        self,
+        model: Denoiser,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """Sample a clip frame by frame; see `Objective.predict`."""
+        known = given.shape[1]
+        stream = self.stream(model, given, generators, steps=steps, context=max(frames, 2))
+        clip = [given]
+        for frame in range(known, frames):
+            start = 0 if frame == known else frame - 1
+            clip.append(stream.advance(conditioning.frames(start, frame + 1)))
+        return torch.cat(clip, 1)
+
+    def stream(
+        self,
+        model: Denoiser,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """Sample frame by frame with a cache; see `Objective.stream`."""
+        return _NextFrameStream(self, model, given, generators, steps, model.new_cache(context))
+
+    def streams_by_default(self, model: Denoiser) -> bool:
+        """Always: a stream has the inputs of training."""
+        return True
+
+    def from_change(self, evaluate: Evaluate, previous: Latent) -> Evaluate:
+        """The network's prediction: for clean latents, its output is added to the frame before."""
+        if self.prediction == "velocity":
+            return evaluate
+        return lambda noisy, sigma: previous + evaluate(noisy, sigma)
+
+
+class _NextFrameStream(LatentStream):
+    """Samples latent frames one after the other; each gets the previous frame as input.
+
+    In the cache, later frames see a frame as it was evaluated last, still noisy, as in training.
+    Its final latent is an input of the frame after it.
+    """
+
+    def __init__(
+        self,
+        objective: NextFrame,
+        model: Denoiser,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        steps: int | None,
+        cache: Cache,
+    ) -> None:
+        self._objective, self._steps = objective, steps
+        self._model, self._cache = model, cache
+        self._generators = generators
+        self._last = given
+
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """Sample the next latent frame; see `LatentStream.advance`."""
+        done, last = self._last.shape[1], self._last[:, -1:]
+        if not self._cache.frames:
+            given, clean = self._last, self._last.new_zeros(self._last.shape[:2])
+            self._extend(given, clean, conditioning.frames(0, done), frames_before(given))
+            self._cache.keep(done)
+        own = conditioning.frames(done, done + 1)
+
+        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
+            return self._extend(noisy, sigma, own, last)
+
+        noise = drawn_noise(last.shape[1:], self._generators).to(last)
+        after = self._objective.from_change(evaluate, last)
+        self._last = self._objective.sample(after, noise, noise[:, :0], self._steps)
+        self._cache.keep(1)
+        return self._last
+
+    def _extend(
+        self, noisy: Latent, sigma: Sigmas, conditioning: Conditioning, previous: Latent
+    ) -> Latent:
+        clean = previous.new_zeros(previous.shape[:2])
+        past = {"previous": previous, "previous_sigma": clean}
+        return self._model.extend(noisy, sigma, conditioning, self._cache, **past)
+
+
+def frames_before(latents: Latent) -> Latent:
+    """The previous frame of each frame `[B, L, C, h, w]`; for the first frame, itself."""
+    return torch.cat([latents[:, :1], latents[:, :-1]], 1)

@@ -1,0 +1,145 @@
+"""The `Objective` interface: how a model learns from clips, and how it then predicts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from acwm_core.errors import RecipeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import Denoiser, DynamicsModel, InputKind, LatentStream
+from acwm_core.model.shapes import Latent
+
+ModelT = TypeVar("ModelT", bound=DynamicsModel)
+
+
+class Objective(ABC, Generic[ModelT]):
+    """How a model learns from clips, and how it predicts what it has learned.
+
+    An objective has neither weights nor state: its parameters come from the recipe, and the model
+    is an argument of every method. Latents, actions and noise are those of whole clips; no method
+    sees pixels.
+
+    Random numbers of a clip come from the clip's own generator, on the CPU, so that they depend
+    neither on the other clips of the batch nor on the device.
+
+    Attributes:
+        trains: the class of the models that it trains, `Denoiser` or `Predictor`.
+        causal: whether the model has to be causal in time.
+        inputs: what it gives a denoiser beside noisy latents and their noise levels: further
+            latents or levels, by name (`Denoiser.inputs`).
+        steps: default number of network evaluations per prediction; None if there is no choice.
+    """
+
+    trains: type[ModelT]
+    causal: bool = False
+    inputs: Mapping[str, InputKind] = {}
+    steps: int | None = None
+
+    @abstractmethod
+    def loss(
+        self,
+        model: ModelT,
+        latents: Latent,
+        conditioning: Conditioning,
+        generators: Sequence[torch.Generator],
+        known: int,
+    ) -> Tensor:
+        """Training loss of a batch of clips, a scalar, over the frames after the given ones.
+
+        Args:
+            model: the model to train.
+            latents: clean latents `[B, L, C, h, w]`, L > `known`.
+            conditioning: the embedded actions of the clips.
+            generators: one CPU generator per clip.
+            known: number of latent frames that are given.
+        """
+
+    @abstractmethod
+    def predict(
+        self,
+        model: ModelT,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """Predict a clip that starts with the given latent frames.
+
+        Args:
+            model: a trained model.
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
+            conditioning: the embedded actions of the clip.
+            frames: length L of the clip, including the given frames.
+            generators: one CPU generator per clip.
+            steps: number of network evaluations, if there is a choice; `steps` of the objective by
+                default.
+
+        Returns:
+            `[B, L, C, h, w]`; its first K frames are `given`.
+        """
+
+    def stream(
+        self,
+        model: ModelT,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """Predict one latent frame at a time, without end. Optional.
+
+        Args:
+            model: a trained model, causal in time.
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
+            generators: one CPU generator per clip.
+            steps: as in `predict`.
+            context: number of latent frames that a frame sees, including itself, at least 2; for
+                models whose memory is bounded in this way.
+
+        Raises:
+            RecipeError: models with this objective, or this model, cannot be streamed.
+        """
+        raise RecipeError(
+            f"a model trained with {type(self).__name__} cannot be streamed: train with "
+            "objective=diffusion_forcing or next_frame"
+        )
+
+    def streams_by_default(self, model: ModelT) -> bool:
+        """Whether a model was trained for its stream, which is then the default of rollouts."""
+        return False
+
+    def check_model(self, model: DynamicsModel) -> None:
+        """Refuse a model that this objective cannot train.
+
+        Raises:
+            RecipeError: says what the model lacks, and what to choose instead.
+        """
+        of, name = type(model).__name__, type(self).__name__
+        if not isinstance(model, self.trains):
+            kind, other = (
+                ("removes noise step by step", "objective=regression")
+                if issubclass(self.trains, Denoiser)
+                else ("predicts frames at once", "objective=diffusion_forcing")
+            )
+            raise RecipeError(
+                f"{name} needs a model that {kind} (a {self.trains.__name__}), which {of} is not: "
+                f"choose another model or {other}"
+            )
+        missing = {*self.inputs} - {*(model.inputs if isinstance(model, Denoiser) else ())}
+        if missing:
+            raise RecipeError(
+                f"{name} needs a model with the further inputs {', '.join(self.inputs)}, which "
+                f"{of} does not take: choose another model or objective=diffusion_forcing"
+            )
+        if self.causal and not model.causal:
+            raise RecipeError(
+                f"{name} needs a model that is causal in time, but {of} with these parameters is "
+                "not: set model.causal=true if it has that parameter, or objective=full_sequence"
+            )

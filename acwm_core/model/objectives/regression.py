@@ -1,0 +1,70 @@
+"""Regression: the squared error of a prediction without noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from acwm_core.errors import check_shape
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import LatentStream, Predictor
+from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.shapes import Latent
+
+
+class Regression(Objective[Predictor]):
+    """Mean squared error of the predicted latents, with gradients through the whole clip.
+
+    A model therefore predicts means: what cannot be known becomes blurred.
+    """
+
+    trains = Predictor
+
+    def loss(
+        self,
+        model: Predictor,
+        latents: Latent,
+        conditioning: Conditioning,
+        generators: Sequence[torch.Generator],
+        known: int,
+    ) -> Tensor:
+        """Mean squared error of the latents after the given ones; see `Objective.loss`."""
+        predicted = _predicted(model, latents[:, :known], conditioning, latents.shape[1])
+        return functional.mse_loss(predicted.float(), latents[:, known:].float())
+
+    def predict(
+        self,
+        model: Predictor,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator],
+        steps: int | None = None,
+    ) -> Latent:
+        """Predict the clip in one pass, without noise; see `Objective.predict`."""
+        return torch.cat([given, _predicted(model, given, conditioning, frames).to(given)], 1)
+
+    def stream(
+        self,
+        model: Predictor,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """The model's own stream; see `Predictor.stream`."""
+        return model.stream(given, context=context)
+
+    def streams_by_default(self, model: Predictor) -> bool:
+        """Whether the model has a stream: it was trained to carry its state over the clip."""
+        return model.streams
+
+
+def _predicted(model: Predictor, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
+    made = model(given, conditioning, frames)
+    check_shape(model, "forward", made, len(given), frames - given.shape[1], *given.shape[2:])
+    return made

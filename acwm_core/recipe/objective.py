@@ -1,0 +1,88 @@
+"""Which objective a composed recipe has: the one chosen for its model, or the model's own."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, cast
+
+from acwm_core.plugins import catalog
+from acwm_core.renamed import RenamedWarning
+
+USUAL = "full_sequence"
+"""The objective of a recipe that names none."""
+
+FOLLOWS = "follows_model"
+"""Key of the section `objective`: a model with an objective of its own learns by that instead. It
+is set where such a model is chosen later than the objective, and where a recipe says so."""
+
+INHERITED = "inherited"
+"""Key in a recipe's section `objective` for the parameters of objectives that it replaced."""
+
+
+def chosen(changes: Mapping[str, Any], merged: dict[str, Any]) -> dict[str, Any]:
+    """Note in a recipe, into which changes were merged, whether its objective follows its model."""
+    objective: Mapping[str, Any] = changes.get("objective") or {}
+    if "name" in objective and FOLLOWS not in objective:
+        merged["objective"].pop(FOLLOWS, None)
+    elif objective_of(changes.get("model") or {}):
+        merged["objective"] = {**(merged.get("objective") or {}), FOLLOWS: True}
+    return merged
+
+
+def objective_of(model: Mapping[str, Any]) -> str | None:
+    """The objective that the model of this section was registered with, if any."""
+    models, name = catalog().registry("model"), model.get("name")
+    return models[name].objective if isinstance(name, str) and name in models else None
+
+
+def inherited(old: Mapping[str, Any]) -> dict[str, Any]:
+    """What a new objective inherits from the section of the one that it replaces.
+
+    The noise path has the same meaning for all objectives of flow matching, so parameters are kept
+    until it is known which of them the new one takes.
+    """
+    before = old.get(INHERITED, {})
+    own = {name: value for name, value in old.items() if name not in ("name", FOLLOWS, INHERITED)}
+    return {INHERITED: {**before, **own}}
+
+
+def resolved(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    """A composed recipe with its final objective.
+
+    If the model was chosen without an objective, e.g. by ``model=recurrent``, it is the one that
+    the model was registered with, if any; else the one that the recipe names.
+    """
+    objective: Any = recipe.get("objective") or {}
+    if not isinstance(objective, Mapping):
+        return {**recipe}  # the check of the section says what is wrong
+    values = {"name": USUAL, **cast(Mapping[str, Any], objective)}
+    own = objective_of(recipe.get("model") or {})
+    if (values.pop(FOLLOWS, False) or "name" not in objective) and own:
+        values = {"name": own}
+    return {**recipe, "objective": values}
+
+
+def with_current_sections(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of a recipe in which the former `flow` is the section `objective`."""
+    current = {name: value for name, value in sections.items() if name != "flow"}
+    if isinstance(model := current.get("model"), Mapping):  # `previous` follows from the objective
+        kept = cast(Mapping[str, Any], model).items()
+        current["model"] = {name: value for name, value in kept if name != "previous"}
+    flow = sections.get("flow")
+    if "flow" not in sections:
+        return current
+    warnings.warn(
+        "the section flow of recipes is now called objective: flow.objective=NAME is "
+        "objective=NAME, and flow.shift=5 is objective.shift=5",
+        RenamedWarning,
+        stacklevel=2,
+    )
+    if not isinstance(flow, Mapping):
+        return {**current, "objective": flow} if flow else current
+    values = dict(cast(Mapping[str, Any], flow))
+    if "objective" in values:
+        values = {"name": values.pop("objective"), FOLLOWS: True, **values}
+        if values["name"] != "next_frame":  # others had these parameters too, without an effect
+            values = {key: v for key, v in values.items() if key not in ("past_noise", "own_past")}
+    return {**current, "objective": {**values, **(current.get("objective") or {})}}

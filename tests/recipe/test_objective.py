@@ -1,0 +1,119 @@
+"""The objective of a recipe: swapped by a word, following its model, read from older recipes."""
+
+import warnings
+
+import pytest
+import yaml
+
+from acwm_core.errors import RecipeError
+from acwm_core.recipe import Recipe, compose
+from acwm_core.renamed import RenamedWarning
+
+SMALL = {"shift": 20.0, "prediction": "clean", "loss_on": "clean", "weighting": "none", "steps": 4}
+PAST = {"past_noise": 0.3, "own_past": 0.0}
+
+
+def objective(*words, recipe="push_cube_small"):
+    found = compose(recipe, words).objective
+    return found.name, found.params
+
+
+def test_a_new_objective_keeps_the_noise_path_and_drops_the_rest():
+    assert objective() == ("diffusion_forcing", SMALL)
+    assert objective("objective=next_frame", "objective.own_past=0.5") == (
+        "next_frame",
+        {**SMALL, "past_noise": 0.3, "own_past": 0.5},
+    )
+    assert objective("+next_frame", "objective=full_sequence") == ("full_sequence", SMALL)
+    with pytest.raises(RecipeError, match="FullSequence has no parameter 'own_past'"):
+        objective("objective=full_sequence", "objective.own_past=0.5")
+
+
+def test_a_model_with_an_objective_of_its_own_brings_it():
+    for words in (
+        ["model=recurrent"],
+        ["+recurrent"],
+        ["+next_frame", "+recurrent"],
+        ["+recurrent", "+small", "+next_frame"],  # whose objectives follow the model
+    ):
+        assert objective(*words) == ("regression", {})
+    assert objective("+recurrent", "model=dit_xs") == ("diffusion_forcing", SMALL)
+
+
+def test_an_objective_chosen_with_the_model_or_later_stays(tmp_path):
+    assert objective("+recurrent", "objective=next_frame")[0] == "next_frame"
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("extends: push_cube_small\nmodel: recurrent\nobjective: next_frame\n")
+    assert objective(recipe=mine)[0] == "next_frame"
+    mine.write_text("extends: push_cube_small\nmodel: recurrent\n")
+    assert objective(recipe=mine) == ("regression", {})
+
+
+def test_a_saved_recipe_says_what_was_used(tmp_path):
+    saved = tmp_path / "saved.yaml"
+    for words in (["model=recurrent"], ["+next_frame"], ["objective.shift=7"]):
+        recipe = compose("push_cube_small", words)
+        saved.write_text(recipe.to_yaml())
+        assert compose(saved) == recipe
+        assert "follows" not in saved.read_text()
+
+
+def test_a_recipe_that_names_none_is_one_level_per_clip():
+    parts = {"codec": "compact", "model": "dit_xs", "conditioner": "adaln"}
+    sections = {name: {"name": part} for name, part in parts.items()}
+    recipe = Recipe.from_dict({**sections, "data": {"path": "data"}})
+    assert recipe.objective.name == "full_sequence"
+    sections["model"] = {"name": "recurrent"}
+    recipe = Recipe.from_dict({**sections, "data": {"path": "data"}})
+    assert recipe.objective.name == "regression"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["flow.shift=5"], ["objective.shift=5"]),
+        (["flow.objective=next_frame"], ["objective=next_frame"]),
+        (["+next_frame", "flow.own_past=0.5"], ["+next_frame", "objective.own_past=0.5"]),
+        (["model=recurrent", "flow.objective=next_frame"], ["model=recurrent"]),
+    ],
+)
+def test_the_former_section_is_read_from_a_command_line(old, new):
+    with pytest.warns(RenamedWarning, match=r"flow\.objective=NAME is objective=NAME"):
+        assert compose("push_cube_small", old) == compose("push_cube_small", new)
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["+next_frame"], ["+recurrent"], ["+next_frame", "+recurrent"]]
+)
+def test_the_former_section_is_read_from_a_run_folder(tmp_path, words):
+    """As acwm wrote it before objectives were components: every model had all parameters."""
+    recipe = compose("push_cube_small", words)
+    old = recipe.to_dict()
+    del old["objective"]
+    name = "next_frame" if "+next_frame" in words else "diffusion_forcing"
+    old["flow"] = {"objective": name, **SMALL, **PAST}
+    if "inputs" in old["model"]:
+        del old["model"]["inputs"]
+        old["model"]["previous"] = None
+    saved = tmp_path / "recipe.yaml"
+    saved.write_text(yaml.safe_dump(old))
+    with pytest.warns(RenamedWarning):
+        assert compose(saved) == recipe
+
+
+def test_an_overlay_of_before_replaces_what_it_lists(tmp_path):
+    (tmp_path / "overlays").mkdir()
+    (tmp_path / "overlays/old.yaml").write_text(
+        "replace:\n  flow.objective: {diffusion_forcing: next_frame}\n"
+        "  flow.prediction: {clean: velocity}\n"
+    )
+    (tmp_path / "mine.yaml").write_text("extends: push_cube_small\n")
+    name, params = objective("+old", recipe=tmp_path / "mine.yaml")
+    assert (name, params["prediction"]) == ("next_frame", "velocity")
+
+
+def test_current_recipes_say_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RenamedWarning)
+        for words in ([], ["+next_frame"], ["+recurrent"]):
+            compose("push_cube_small", words)
