@@ -141,7 +141,6 @@ class Compact(Codec):
         return groups.unflatten(0, latents.shape[:2]) / 2 + 0.5
 
     def fingerprint(self) -> str:
-        """Hash of the weights."""
         digest = hashlib.sha256(b"compact")
         for name, value in sorted(self.state_dict().items()):
             digest.update(name.encode())

@@ -88,7 +88,6 @@ class ImageAutoencoder(Codec):
         return _by_chunks(pixels, latents)
 
     def fingerprint(self) -> str:
-        """Hash of configuration, weights and normalisation."""
         numbers = [*self.mean.flatten().tolist(), *self.deviation.flatten().tolist()]
         return fingerprint(f"{self.name} {numbers}", self.autoencoder)
 

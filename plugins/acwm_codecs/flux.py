@@ -67,5 +67,4 @@ class Flux(Codec):
         return self.autoencoder.decode(raw).sample / 2 + 0.5  # pyright: ignore
 
     def fingerprint(self) -> str:
-        """Hash of configuration and weights."""
         return fingerprint("flux", self.autoencoder)

@@ -61,6 +61,5 @@ class Identity(Codec):
         return groups.unflatten(2, (self.temporal_stride, 3)).flatten(1, 2)
 
     def fingerprint(self) -> str:
-        """Hash of the strides."""
         configuration = f"identity {self.spatial_stride} {self.temporal_stride}"
         return hashlib.sha256(configuration.encode()).hexdigest()[:12]

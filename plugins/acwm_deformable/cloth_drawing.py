@@ -86,7 +86,6 @@ class ClothDrawing(Drawing[Cloth]):
             self._build()
 
     def draw(self, simulation: Cloth) -> Frame:
-        """The frame and mask of the cloth and its grippers."""
         cloth = simulation
         normals = normals_of(cloth.nodes)[self._corner_of]
         nodes = cloth.nodes[self._corner_of]

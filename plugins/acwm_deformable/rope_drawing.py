@@ -67,7 +67,6 @@ class RopeDrawing(Drawing[Rope]):
             self.scene.set_visible(1 + k, k < self._tube.stripes)
 
     def draw(self, simulation: Rope) -> Frame:
-        """The frame and mask of a rope and the pole."""
         places, turns = np.zeros((1 + _STRIPES, 3)), np.tile(np.eye(3), (1 + _STRIPES, 1, 1))
         places[0] = (*simulation.pole, _POLE_HALF)
         surface = zip(*self._tube.around(simulation.nodes), strict=True)

@@ -22,7 +22,6 @@ class Linear(nn.Linear):
     """
 
     def forward(self, input: Tensor) -> Tensor:
-        """See `nn.Linear.forward`."""
         large = input.numel() * self.out_features >= SMALL
         if large and _suits_onednn(input) and self.weight.dtype == torch.float32:
             if not torch.is_grad_enabled():

@@ -63,7 +63,6 @@ class Estimator(StateEstimator):
 
     @property
     def physics(self) -> Physics:
-        """What can be measured in the observations."""
         return self._physics
 
     def packages(self) -> tuple[str, ...]:
@@ -77,7 +76,6 @@ class Estimator(StateEstimator):
         return {"weights": fingerprint(self.weights), "limits": limits}
 
     def estimate(self, video: Clip) -> Observation:
-        """See `StateEstimator.estimate`."""
         if tuple(video.shape[1:]) != (3, *self.card.frame_size):
             height, width = self.card.frame_size
             raise ShapeError(
@@ -94,7 +92,6 @@ class Estimator(StateEstimator):
         return Observation(masks, states_of(found, masks, self.layout, self.card))
 
     def pixels(self, field: str, values: NDArray[Any]) -> NDArray[np.float64]:
-        """See `StateEstimator.pixels`."""
         places = (*self.layout.points, *self.layout.curves)
         (plane,) = [place.plane for place in places if place.field == field]
         height, width = self.card.frame_size

@@ -67,7 +67,6 @@ class Features(nn.Module):
                 module[0], module[1] = fuse_conv_bn_eval(layer, norm), nn.Identity()
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Compute the features."""
         fine = self.fine(frames)
         middle = self.middle(fine)
         coarse = self.down(middle)

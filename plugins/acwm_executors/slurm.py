@@ -180,11 +180,6 @@ class SlurmExecutor(BatchExecutor):
         return sum(file.stat().st_size for file in self.folder.glob("units-*"))
 
     def submit(self, jobs: Sequence[Job], program: Sequence[str], logs: Path) -> Mapping[str, str]:
-        """Queue jobs that SLURM starts, signals and may requeue.
-
-        Raises:
-            DataError: SLURM refuses a job.
-        """
         self.folder.mkdir(parents=True, exist_ok=True)
         states = self.states()
         ids = {name: job.id for name, job in states.items() if job.state in ("queued", "running")}

@@ -94,7 +94,6 @@ class ArmDrawing(Drawing[ArmSimulation]):
             self.scene.set_spheres(self._goals + k, goal[None], GOAL_RADIUS)
 
     def draw(self, simulation: ArmSimulation) -> Frame:
-        """Draw the frame and mask of the current state."""
         for k, reached in enumerate(simulation.reached):
             self.scene.set_color(self._goals + k, MET if reached else WAITING)
         arm = slice(self.first_post)

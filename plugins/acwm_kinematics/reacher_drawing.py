@@ -82,7 +82,6 @@ class ReacherDrawing(Drawing[Arm]):
             self.scene.set_color(number, paint)
 
     def draw(self, simulation: Arm) -> Frame:
-        """The frame and mask of the arm and the marker of its goal."""
         places, turns = np.zeros((6, 3)), np.tile(np.eye(3), (6, 1, 1))
         elbow, tip = simulation.points(simulation.angles)
         places[_UPPER, 2] = _UPPER_Z

@@ -133,7 +133,6 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
     _layout: Layout | None = None
 
     def close(self) -> None:
-        """Free the physics worlds."""
         super().close()
         if self._layout is not None:
             self._layout.clearance.close()

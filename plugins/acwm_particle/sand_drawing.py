@@ -58,7 +58,6 @@ class SandDrawing(Drawing[Sand]):
         self._colors = self._paint.copy()
 
     def draw(self, simulation: Sand) -> Frame:
-        """The frame and mask of sand and board."""
         sand = simulation
         # Draw from near to far, so that few grains are drawn that are hidden later.
         away = sand.grains - np.asarray(self.scene.camera.eye, np.float32)

@@ -58,7 +58,6 @@ class WaterDrawing(Drawing[Water]):
         self.scene.set_color(self._water, WATERS[str(factors["colors"])])
 
     def draw(self, simulation: Water) -> Frame:
-        """The frame and mask of water, cup and container."""
         self.scene.set_fluid(self._water, simulation.particles, RADIUS)
         cup = simulation.cup
         places, turns = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))

@@ -75,7 +75,6 @@ class PushDrawing(Drawing[PushSimulation]):
             self.scene.set_color(self.pushers + slot, color)
 
     def draw(self, simulation: PushSimulation) -> Frame:
-        """The frame and mask of the pushers and cubes."""
         cubes, count = simulation.cubes, self.pushers + MAX_CUBES
         places, turns = np.zeros((count, 3)), np.zeros((count, 3, 3))
         rows = [*range(self.pushers), *(self.pushers + slot for slot in cubes.slots)]

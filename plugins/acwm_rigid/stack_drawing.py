@@ -52,7 +52,6 @@ class StackDrawing(Drawing[StackSimulation]):
             self.scene.set_color(self.first_cube + cube, color)
 
     def draw(self, simulation: StackSimulation) -> Frame:
-        """The frame and mask of the robot and the cubes."""
         places, turns = simulation.poses
         turns[self.first_cube :] *= simulation.edge / _EDGE
         return self.scene.render(places, turns)

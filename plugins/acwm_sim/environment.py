@@ -130,7 +130,6 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         self._simulation = None
 
     def close(self) -> None:
-        """Free the resources of the current episode."""
         self._free()
 
     def _start(self, factors: Factors, rng: np.random.Generator) -> None:
