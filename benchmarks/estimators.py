@@ -23,7 +23,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import AcwmError
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_estimators.layout import Layout, layout_of
 from acwm_estimators.targets import MIN_SEEN, points_there, rows_of
 from acwm_estimators.turns import heading

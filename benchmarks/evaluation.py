@@ -34,9 +34,9 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.evaluation import evaluate, evaluator
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.metric import Metric, Rollout
-from acwm_core.evaluation.provenance import KEPT, REFERENCES
+from acwm_core.evaluation.metric import Metric, Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.references import KEPT, REFERENCES
 from acwm_core.evaluation.results import FOLDER as EVALUATION
 from acwm_core.evaluation.results import Summary
 from acwm_core.model.build import build_world_model
@@ -97,7 +97,7 @@ def instrument(clock: Clock, build_metrics: Callable[..., dict[str, Metric]]) ->
     clock.wrap(Codec, "forward", CODEC)
     clock.wrap(EpisodeDataset, "__getitem__", READING)
     clock.wrap(EpisodeDataset, "actions", READING)
-    clock.wrap(Rollout.__dict__["observed"], "func", STATES)
+    clock.wrap(Prediction.__dict__["observed"], "func", STATES)
     clock.wrap(evaluate, "summarise_split", SUMMARY)
     clock.wrap(evaluate, "gap", SUMMARY)
     clock.wrap(Evaluator, "videos", VIDEOS)

@@ -21,9 +21,9 @@ from rich.table import Table
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_core.evaluation.metric import Metric
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
-from acwm_metrics.calibrate import true_rollout
+from acwm_metrics.calibrate import true_prediction
 from acwm_metrics.plugin import PHYSICS
 
 
@@ -51,13 +51,13 @@ def row(folder: Path, split: Split, metrics: dict[str, Metric], clips: int) -> l
     reading = measuring = 0.0
     count = min(clips, len(episodes))
     for index in range(count):
-        rollout = true_rollout(episodes[index], card, estimator)
+        prediction = true_prediction(episodes[index], card, estimator)
         started = time.process_time()
-        _ = rollout.observed
+        _ = prediction.observed
         read = time.process_time()
         for name, metric in metrics.items():
             if metric.unavailable(card, estimator) is None:
-                scores[name].append((metric.value(rollout), metric.weight(rollout)))
+                scores[name].append((metric.value(prediction), metric.weight(prediction)))
         reading, measuring = reading + read - started, measuring + time.process_time() - read
     found = [_summary(metric, scores[name]) for name, metric in metrics.items()]
     return [*found, f"{reading / count:.2f}", f"{measuring / count:.2f}"]

@@ -28,7 +28,7 @@ from acwm_core.checks.trial import shaken
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import TaskEnvironment
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog

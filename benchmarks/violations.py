@@ -22,9 +22,9 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.env.physics import StateEstimator
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.metric import Rollout
-from acwm_core.evaluation.scoring import estimator_for
-from acwm_metrics.calibrate import true_rollout
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.score import estimator_for
+from acwm_metrics.calibrate import true_prediction
 from acwm_metrics.conservation import violations
 
 TRUE = "nothing (false alarms)"
@@ -61,24 +61,24 @@ def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[st
         split = "ood_test" if index % 2 else "ind_test"
         spec = EpisodeSpec(world, split, index, seed=977, options={"size": size})
         true = simulate(environment, spec, frames=frames or None)
-        rollout = true_rollout(true, environment.card, estimator)
-        yield TRUE, _found(rollout)
+        prediction = true_prediction(true, environment.card, estimator)
+        yield TRUE, _found(prediction)
         for name, fault in FAULTS[world].items():
             at = len(true.video) // 3
             try:
                 wrong = with_fault(environment, spec, true.actions, fault, at)
             except NotPossibleError:
                 continue
-            yield name, _found(_predicted(rollout, wrong, estimator))
+            yield name, _found(_predicted(prediction, wrong, estimator))
 
 
-def _predicted(rollout: Rollout, wrong: Episode, estimator: StateEstimator) -> Rollout:
+def _predicted(prediction: Prediction, wrong: Episode, estimator: StateEstimator) -> Prediction:
     video = as_clip(wrong.video)
-    return replace(rollout, prediction=video, estimator=estimator)
+    return replace(prediction, video=video, estimator=estimator)
 
 
-def _found(rollout: Rollout) -> list[str]:
-    return [name for name, frames in violations(rollout).items() if frames.any()]
+def _found(prediction: Prediction) -> list[str]:
+    return [name for name, frames in violations(prediction).items() if frames.any()]
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.metric import Metric, Reads, Rollout, SetMetric
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.metric import Metric, Prediction, Reads, SetMetric
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.shapes import Clip
 from acwm_core.plugins import catalog
 
@@ -75,11 +75,11 @@ class MetricChecks(Suite):
     def _metric(self) -> Any:
         return self.make()
 
-    def _raw_scores(self, rollout: Rollout) -> NDArray[Any]:
-        return self._metric.per_frame(rollout)
+    def _raw_scores(self, prediction: Prediction) -> NDArray[Any]:
+        return self._metric.per_frame(prediction)
 
-    def _score(self, rollout: Rollout) -> float:
-        return self._metric.value(rollout)
+    def _score(self, prediction: Prediction) -> float:
+        return self._metric.value(prediction)
 
     @property
     def _reads_pixels(self) -> bool:
@@ -91,26 +91,26 @@ class MetricChecks(Suite):
         return _estimator_of(self._environment.card)
 
     @functools.cached_property
-    def _perfect(self) -> Rollout:
+    def _perfect(self) -> Prediction:
         """The first frames of an episode and of a branch of it, predicted without error."""
         actions = self._environment.episode.actions[:24]
         backwards = np.concatenate([actions[-2::-1], actions[-1:]])
         clip, branch = map(self._simulated, (actions, backwards))
         return replace(clip, branches=(branch,))
 
-    def _simulated(self, actions: NDArray[np.float32]) -> Rollout:
+    def _simulated(self, actions: NDArray[np.float32]) -> Prediction:
         trial = self._environment
         episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
         video = as_clip(episode.video)
-        return Rollout.of(episode, video, video.clone(), trial.card, self._estimator)
+        return Prediction.of(episode, video.clone(), video, trial.card, self._estimator)
 
-    def _predicted(self, predict: Callable[[Clip], Clip]) -> Rollout:
+    def _predicted(self, predict: Callable[[Clip], Clip]) -> Prediction:
         """The same clip and branch, with predictions computed from the truth by `predict`."""
         clip, branches = self._perfect, self._perfect.branches
-        others = (replace(each, prediction=predict(each.target)) for each in branches)
-        return replace(clip, prediction=predict(clip.target), branches=tuple(others))
+        others = (replace(each, video=predict(each.target)) for each in branches)
+        return replace(clip, video=predict(clip.target), branches=tuple(others))
 
-    def _noisy(self, amount: float) -> Rollout:
+    def _noisy(self, amount: float) -> Prediction:
         """Predictions with Gaussian noise of this standard deviation on all but the first frame."""
         generator = torch.Generator().manual_seed(0)
 
@@ -127,14 +127,14 @@ class MetricChecks(Suite):
             return value > best
         return value < (best if self._reads_pixels else best / 2)  # estimator errors vary
 
-    def _to_be_scored(self, base: type[Metric]) -> Rollout:
+    def _to_be_scored(self, base: type[Metric]) -> Prediction:
         expect_is_a(self._metric, base)
-        rollout = self._noisy(0.1)
-        reason = self._metric.unavailable(rollout.card, rollout.estimator)
+        prediction = self._noisy(0.1)
+        reason = self._metric.unavailable(prediction.card, prediction.estimator)
         expect(reason is None, f"it cannot be measured here: {reason}")
-        value = self._score(rollout)
+        value = self._score(prediction)
         expect(math.isfinite(value), f"a noisy prediction scores {value}")
-        return rollout
+        return prediction
 
     def says_what_it_is(self) -> None:
         """Have the registered name, and everything that tables need."""
@@ -163,7 +163,7 @@ class MetricChecks(Suite):
             "a late video": self._predicted(lambda c: torch.cat([c[:1], c[:1], c[:-2]])),
             "a video that runs backwards": self._predicted(lambda c: c.flip(0)),
         }
-        values = {name: self._score(rollout) for name, rollout in flawed.items()}
+        values = {name: self._score(prediction) for name, prediction in flawed.items()}
         for name, value in values.items():
             better = self._is_better(value, best)
             expect(not better, f"the true video scores {best:.4g}, {name} scores {value:.4g}")
@@ -188,15 +188,15 @@ class MetricChecks(Suite):
 
     def scoring_repeats_and_leaves_no_trace(self) -> None:
         """Give the same scores twice, without changing the inputs."""
-        rollout = self._noisy(0.1)
-        prediction, target = rollout.prediction.clone(), rollout.target.clone()
-        states = {name: values.copy() for name, values in rollout.states.items()}
-        first, second = (self._raw_scores(rollout) for _ in range(2))
+        prediction = self._noisy(0.1)
+        video, target = prediction.video.clone(), prediction.target.clone()
+        states = {name: values.copy() for name, values in prediction.states.items()}
+        first, second = (self._raw_scores(prediction) for _ in range(2))
         expect(np.array_equal(first, second, equal_nan=True), "a second scoring differs")
-        same = torch.equal(prediction, rollout.prediction) and torch.equal(target, rollout.target)
+        same = torch.equal(video, prediction.video) and torch.equal(target, prediction.target)
         expect(same, "it changes the video that it is given")
         for name, values in states.items():
-            same = np.array_equal(values, rollout.states[name], equal_nan=True)
+            same = np.array_equal(values, prediction.states[name], equal_nan=True)
             expect(same, f"it changes state {name!r}")
 
 
@@ -205,17 +205,17 @@ class ClipMetricChecks(MetricChecks):
 
     def scores_a_clip(self) -> None:
         """Construct the metric and score a clip, frame by frame and as a whole."""
-        rollout = self._to_be_scored(Metric)
-        scores, frames = self._metric.per_frame(rollout), len(rollout.target)
+        prediction = self._to_be_scored(Metric)
+        scores, frames = self._metric.per_frame(prediction), len(prediction.target)
         expect(np.shape(scores) == (frames,), f"{frames} frames got {np.shape(scores)} scores")
         expect(np.isfinite(scores).any(), "no frame of a noisy prediction gets a finite score")
-        (low, high), value = self._metric.bounds, self._metric.value(rollout)
+        (low, high), value = self._metric.bounds, self._metric.value(prediction)
         expect(low <= value <= high, f"the score {value:.4g} is outside its bounds {low} to {high}")
 
     def summary_of_equals_is_their_value(self) -> None:
         """Summarise equal values as that value."""
-        rollout = self._noisy(0.1)
-        value, weight = self._metric.value(rollout), self._metric.weight(rollout)
+        prediction = self._noisy(0.1)
+        value, weight = self._metric.value(prediction), self._metric.weight(prediction)
         summary = self._metric.summarise([value] * 3, [weight] * 3)
         same = math.isclose(summary, value, rel_tol=1e-6)
         expect(same, f"three times {value:.4g} is {summary:.4g}")
@@ -224,14 +224,14 @@ class ClipMetricChecks(MetricChecks):
 class SetMetricChecks(MetricChecks):
     """Checks of a metric that compares sets of clips, on sideways shifts of one clip."""
 
-    def _raw_scores(self, rollout: Rollout) -> NDArray[Any]:
-        return self._metric.features(rollout)
+    def _raw_scores(self, prediction: Prediction) -> NDArray[Any]:
+        return self._metric.features(prediction)
 
-    def _score(self, rollout: Rollout) -> float:
-        width = rollout.target.shape[-1]
-        pairs = rollout.prediction, rollout.target
+    def _score(self, prediction: Prediction) -> float:
+        width = prediction.target.shape[-1]
+        pairs = prediction.video, prediction.target
         moved = ([clip.roll(width * quarter // 4, -1) for clip in pairs] for quarter in range(4))
-        clips = (replace(rollout, prediction=made, target=true) for made, true in moved)
+        clips = (replace(prediction, video=made, target=true) for made, true in moved)
         return self._metric.distance(np.stack([self._metric.features(clip) for clip in clips]))
 
     def scores_a_set(self) -> None:
@@ -239,8 +239,8 @@ class SetMetricChecks(MetricChecks):
         expect_is_a(self._metric, SetMetric)
         shape = np.shape(self._metric.features(self._noisy(0.1)))
         expect(len(shape) == 2 and shape[0] == 2, f"features of a clip are {shape}, not (2, D)")
-        rollout = self._to_be_scored(SetMetric)
-        expect(np.isnan(self._metric.per_frame(rollout)).all(), "a clip has a score of its own")
+        prediction = self._to_be_scored(SetMetric)
+        expect(np.isnan(self._metric.per_frame(prediction)).all(), "a clip has a score of its own")
 
 
 def _estimator_of(card: EnvironmentCard) -> StateEstimator | None:

@@ -1,23 +1,24 @@
-"""Which clips are predicted, their data, and the rows that predict them."""
+"""Which clips are predicted, and what predicts them. Does not import torch."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.clips import window_actions
-from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import SPLITS, Episode
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.protocol import protocol_named
-from acwm_core.model.shapes import Actions, Clip, Video
+
+if TYPE_CHECKING:
+    from acwm_core.data.episodes import EpisodeDataset
+    from acwm_core.model import shapes
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 """A row of the results, named after what made its prediction:
@@ -37,7 +38,7 @@ PREDICTORS: tuple[Predictor, ...] = ("model", "shuffled", "copy", "codec", "trut
 
 
 @dataclass(frozen=True)
-class ClipPlan:
+class Clip:
     """One clip to predict, decided before any video is read.
 
     It is identified by split, episode and start.
@@ -55,21 +56,15 @@ class ClipPlan:
         given: number of context frames.
     """
 
-    split: str
-    episode: int
-    start: int
-    frames: int
-    donor: int
-    donor_start: int
-    seed: int
+    split: str = ""
+    episode: int = 0
+    start: int = 0
+    frames: int = 0
+    donor: int = 0
+    donor_start: int = 0
+    seed: int = 0
     noise_floor: bool = True
     given: int = 1
-
-    def scored(self, episode: Episode, target: Clip, made: Clip) -> tuple[Episode, Clip, Clip]:
-        """The clip, its video and a prediction from the last context frame on, for the metrics."""
-        known = self.given - 1
-        cut = cut_episode(episode, known, len(episode.video) - known) if known else episode
-        return cut, target[known:], made[known:]
 
     @property
     def where(self) -> str:
@@ -77,52 +72,9 @@ class ClipPlan:
         return f"in episode {self.episode} of {self.split}, from frame {self.start}"
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A clip of T frames with everything recorded about it.
-
-    Attributes:
-        plan: which clip it is.
-        episode: the part of the episode that the plan selects, see `cut_episode`.
-        video: `[T, 3, H, W]` float32 in [0, 1].
-        donor_actions: the donor's actions `[T, A]`, except between context frames, where they are
-            the clip's own; the last row is zero.
-    """
-
-    plan: ClipPlan
-    episode: Episode
-    video: Clip
-    donor_actions: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Clips of equal length on the model's device: the truth, actions, and seeds of the noise.
-
-    The first `given` frames of the truth are the model's context frames.
-    """
-
-    video: Video
-    actions: Actions
-    donor_actions: Actions
-    seeds: list[int]
-    given: int = 1
-
-    @classmethod
-    def of(cls, samples: Sequence[Sample], device: torch.device) -> Batch:
-        """Stack samples."""
-        return cls(
-            torch.stack([sample.video for sample in samples]).to(device),
-            torch.as_tensor(np.stack([s.episode.actions for s in samples]), device=device),
-            torch.as_tensor(np.stack([s.donor_actions for s in samples]), device=device),
-            [sample.plan.seed for sample in samples],
-            samples[0].plan.given,
-        )
-
-
 def plan_clips(
     split: str, lengths: Sequence[int], config: EvaluationConfig, given: int = 1
-) -> list[ClipPlan]:
+) -> list[Clip]:
     """The clips of a split with episodes of these lengths, in order, with `given` context frames.
 
     Raises:
@@ -137,8 +89,8 @@ def plan_clips(
             "the actions of the other: generate more"
         )
     donors = [chosen[place] for place in derangement(len(chosen), config.seed)]
-    plans = [
-        ClipPlan(
+    clips = [
+        Clip(
             split,
             episode,
             start,
@@ -152,13 +104,13 @@ def plan_clips(
         for number, (episode, donor) in enumerate(zip(chosen, donors, strict=True))
         for start, frames in protocol.windows(lengths[episode], config)
     ]
-    short = [plan for plan in plans if given > 1 and plan.frames <= given]
+    short = [clip for clip in clips if given > 1 and clip.frames <= given]
     if short:
         raise DataError(
             f"a clip of episode {short[0].episode} of {split} has {short[0].frames} frames, of "
             f"which {given} are given: set a lower evaluation.context_frames"
         )
-    return plans
+    return clips
 
 
 def derangement(count: int, seed: int) -> list[int]:
@@ -180,23 +132,34 @@ def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
     return int(np.random.SeedSequence(identity).generate_state(1)[0])
 
 
-def load_samples(plans: Iterable[ClipPlan], episodes: EpisodeDataset) -> Iterator[Sample]:
-    """Read clips one after the other; consecutive clips of an episode decode it only once."""
-    for number, group in itertools.groupby(plans, lambda plan: plan.episode):
+def read_clips(clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[tuple[Clip, Episode]]:
+    """Each clip with its part of the episode; consecutive clips of one episode decode it once."""
+    for number, group in itertools.groupby(clips, lambda clip: clip.episode):
         episode = episodes[number]
-        for plan in group:
-            clip = cut_episode(episode, plan.start, plan.frames)
-            donated = window_actions(episodes.actions(plan.donor), plan.donor_start, plan.frames)
-            donated[: plan.given - 1] = clip.actions[: plan.given - 1]
-            yield Sample(plan, clip, as_clip(clip.video), donated)
+        for clip in group:
+            yield clip, cut_episode(episode, clip.start, clip.frames)
 
 
-def as_clip(video: NDArray[np.uint8]) -> Clip:
+def donor_actions(
+    clip: Clip, own: NDArray[np.float32], episodes: EpisodeDataset
+) -> NDArray[np.float32]:
+    """The other episode's actions for a clip, `[T, A]`; between context frames, the clip's `own`.
+
+    The last row is zero.
+    """
+    actions = window_actions(episodes.actions(clip.donor), clip.donor_start, clip.frames)
+    actions[: clip.given - 1] = own[: clip.given - 1]
+    return actions
+
+
+def as_clip(video: NDArray[np.uint8]) -> shapes.Clip:
     """A video `[T, H, W, 3]` uint8 as a clip `[T, 3, H, W]` float32 in [0, 1].
 
     It is contiguous with channels first, like predictions: pixel metrics then take a third of the
     time.
     """
+    import torch  # planning clips does not need it
+
     return torch.as_tensor(video).permute(0, 3, 1, 2).contiguous().float() / 255
 
 
@@ -217,10 +180,3 @@ def cut_episode(episode: Episode, start: int, frames: int) -> Episode:
         masks=episode.masks[inside],
         contacts=contacts[kept],
     )
-
-
-def batches(samples: Iterator[Sample], size: int) -> Iterator[list[Sample]]:
-    """Group up to `size` consecutive samples of equal length."""
-    for _, alike in itertools.groupby(samples, lambda sample: len(sample.video)):
-        while group := list(itertools.islice(alike, size)):
-            yield group

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from acwm_core.env.episode import SPLITS
-from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors import RecipeError, suggest
 from acwm_core.evaluation.protocol import protocol_named
-from acwm_core.recipe.compose import RENAMED
 from acwm_core.recipe.metrics import metric_configs
-from acwm_core.untrusted import parse_json, read_bytes
 
 MINIMA = {
     **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
@@ -22,13 +19,6 @@ MINIMA = {
     **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
 """The smallest allowed value of each setting that is not None."""
-
-
-WITHOUT_EFFECT = ("batch_size", "device")
-"""Settings that change results only by rounding."""
-
-OF_SWEEPS = ("severity_episodes",)
-"""Settings that an evaluation without ``--sweep`` does not use."""
 
 
 @dataclass(frozen=True)
@@ -132,47 +122,6 @@ class EvaluationConfig:
     def _require(self, name: str, holds: bool, what: str) -> None:
         if not holds:
             raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
-
-
-def refuse_other_result(
-    file: Path, config: EvaluationConfig, data: Mapping[str, str | None], free: Sequence[str] = ()
-) -> None:
-    """Refuse to replace a result that was made with other settings, or on other data.
-
-    Args:
-        file: the result file; a missing or unreadable one may be replaced.
-        config: the current settings.
-        data: checksums of the current splits. For a sweep: its values, with None because their
-            data is not generated yet.
-        free: further settings that may differ.
-
-    Raises:
-        DataError: settings or data differ; the message says how.
-    """
-    try:
-        facts = parse_json(read_bytes(file))["provenance"]
-        settings: dict[str, Any] = facts["evaluation"]
-        there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
-        checksums = dict[str, str](facts["dataset"]["checksums"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        return
-    now = {
-        name: value
-        for name, value in config.to_dict().items()
-        if name not in (*WITHOUT_EFFECT, *free)
-    }
-    differences = setting_overrides(now, there)
-    differences += [
-        f"{name} of other data"
-        for name, checksum in data.items()
-        if checksum and checksums.get(name) != checksum
-    ]
-    differences += [name for name in checksums if name not in data]
-    if differences:
-        raise DataError(
-            f"{file} holds a result made with {', '.join(differences)}: write to another folder "
-            "with --out, or replace it with --overwrite"
-        )
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:

@@ -22,16 +22,23 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.benchmark import published_for
-from acwm_core.evaluation.clip_results import EPISODES, gap, summarise_split, write_results
 from acwm_core.evaluation.clips import plan_clips
-from acwm_core.evaluation.config import OF_SWEEPS, EvaluationConfig, refuse_other_result
-from acwm_core.evaluation.evaluator import Evaluator, Results, ShownClip, StepsSweep
-from acwm_core.evaluation.provenance import provenance, scores_with_references
-from acwm_core.evaluation.replacing import replacing_result
-from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
-from acwm_core.evaluation.scoring import build_metrics, estimator_for, split_available
-from acwm_core.evaluation.simulator import Simulated, ask_simulator, units_of_work
-from acwm_core.evaluation.videos import REPORT_PANEL, magnification
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.provenance import provenance
+from acwm_core.evaluation.references import scores_with_references
+from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary
+from acwm_core.evaluation.score import build_metrics, estimator_for, split_available
+from acwm_core.evaluation.storage import (
+    EPISODES,
+    OF_SWEEPS,
+    refuse_other_result,
+    replacing_result,
+    write_scores,
+)
+from acwm_core.evaluation.summarise import gap, summarise_split
+from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip, magnification
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import run_to_write
@@ -107,21 +114,24 @@ def _evaluate(
     home: Path,
     progress: bool,
 ) -> Summary:
-    started = time.monotonic()
-    config, given = evaluator.config, evaluator.given
-    plans = {s: plan_clips(s, each.lengths, config, given) for s, each in datasets.items()}
-    total = sum(evaluator.count_rows(each) for each in plans.values())
-    with progress_bar(evaluator, total + units_of_work(evaluator, plans), progress) as told:
-        results = {s: scores_with_references(told, plans[s], datasets[s]) for s in datasets}
-        sweeps = {s: told.sweep(plans[s], datasets[s]) for s in datasets}
-        found = ask_simulator(told, plans, datasets)
-    videos = [v for s in datasets for v in evaluator.videos(plans[s], datasets[s], results[s])]
+    started, config = time.monotonic(), evaluator.config
+    clips = {
+        split: plan_clips(split, each.lengths, config, evaluator.given)
+        for split, each in datasets.items()
+    }
+    total = sum(evaluator.count_rows(each) for each in clips.values())
+    with progress_bar(evaluator, total + units_of_work(evaluator, clips), progress) as told:
+        scores = {s: scores_with_references(told, clips[s], datasets[s]) for s in datasets}
+        sweeps = {s: told.sweep(clips[s], datasets[s]) for s in datasets}
+        found = intervene(told, clips, datasets)
+    videos = [v for s in datasets for v in evaluator.videos(clips[s], datasets[s], scores[s])]
     videos += found.videos
-    results = {s: [*each, *found.rows.get(s, ())] for s, each in results.items()}
-    summary = _summarise(home, recipe, evaluator, results, sweeps, videos, found)
+    scores = {split: [*each, *found.scores.get(split, ())] for split, each in scores.items()}
+    summary = _summarise(home, recipe, evaluator, scores, sweeps, found)
+    summary.videos.extend(record for record, _ in videos)
     summary.provenance.update(provenance(folder, recipe, evaluator, datasets))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
-    _write(home, summary, results, videos)
+    _write(home, summary, scores, videos)
     return summary
 
 
@@ -216,49 +226,51 @@ def _summarise(
     home: Path,
     recipe: Recipe,
     evaluator: Evaluator,
-    results: Results,
-    sweeps: Mapping[str, StepsSweep],
-    videos: Sequence[ShownClip],
-    found: Simulated,
+    scores: Mapping[str, list[Score]],
+    sweeps: Mapping[str, Mapping[int, list[Score]]],
+    found: Interventions,
 ) -> Summary:
+    """The summary of all splits, without videos and provenance."""
     metrics, config, card = evaluator.metrics, evaluator.config, evaluator.card
-    inside, outside = results.get("ind_test"), results.get("ood_test")
-    parts = {
-        "env": card.name,
-        **{name: getattr(recipe, name).name for name in ("codec", "model", "conditioner")},
-    }
+    inside, outside = scores.get("ind_test"), scores.get("ood_test")
+    named = ("codec", "model", "conditioner")
+    parts = {"env": card.name, **{name: getattr(recipe, name).name for name in named}}
     return Summary(
         run=home.resolve().parent.name,
         parts=parts,
-        metrics={n: m.info for n, m in metrics.items()},
+        metrics={name: metric.info for name, metric in metrics.items()},
         headline=evaluator.headline,
         splits={
-            s: replace(
-                summarise_split(each, metrics, config.seed, sweeps[s]),
-                counterfactual=found.counterfactual.get(s),
-                predictability=found.predictability.get(s),
+            split: replace(
+                summarise_split(each, metrics, config.seed, sweeps[split]),
+                counterfactual=found.counterfactual.get(split),
+                predictability=found.predictability.get(split),
             )
-            for s, each in results.items()
+            for split, each in scores.items()
         },
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
         environment={
             **{name: getattr(card, name) for name in ("name", "summary", "fps", "citation")},
             "action": asdict(card.action),
         },
-        videos=[record for record, _ in videos],
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},
         published=published_for({**parts, "fraction": recipe.data["fraction"]}),
     )
 
 
-def _write(folder: Path, summary: Summary, results: Results, videos: Sequence[ShownClip]) -> None:
+def _write(
+    folder: Path,
+    summary: Summary,
+    scores: Mapping[str, list[Score]],
+    videos: Sequence[ShownClip],
+) -> None:
     height = summary.provenance["dataset"]["frame_size"][0]
     with writing(folder), replacing_result(folder) as new:
         for record, frames in videos:
             fps = summary.environment["fps"]
             write_mp4(new / VIDEOS / record.file, frames, fps, magnification(height, REPORT_PANEL))
-        write_results(new / EPISODES, [r for split in results.values() for r in split])
+        write_scores(new / EPISODES, [score for split in scores.values() for score in split])
         summary.write(new)
     home = folder / VIDEOS
     for old in {*home.glob("*.mp4")} - {home / record.file for record, _ in videos}:

@@ -1,4 +1,4 @@
-"""The `Metric` interface: scores one predicted clip, and summarises many."""
+"""A `Prediction` of a clip, and the `Metric` that scores one and summarises many."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -16,9 +16,10 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import PluginError, ShapeError, check_shape, noting
+from acwm_core.evaluation.clips import Clip, Predictor
 
 if TYPE_CHECKING:
-    from acwm_core.model.shapes import Clip
+    from acwm_core.model import shapes
 
 Result = TypeVar("Result")
 
@@ -27,61 +28,76 @@ Numbers = Sequence[float] | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Rollout:
-    """A predicted clip with the true clip and the simulator's ground truth.
+class Prediction:
+    """A predicted clip of T frames beside the true one and all that the simulator knows of it.
 
     Attributes:
-        prediction: `[T, 3, H, W]` float32 in [0, 1].
-        target: the simulated video, like `prediction`; frame 0 was given to the model.
-        actions: `[T, A]` raw actions.
+        video: the predicted frames, `[T, 3, H, W]` float32 in [0, 1].
+        target: the true ones, like `video`; frame 0 was given to the model.
+        actions: `[T, A]` raw actions of the true clip.
         states: ground-truth arrays by name, each `[T, …]`.
         masks: `[T, H, W]` uint8 instance ids.
         contacts: `[K, 3]` rows (frame, id, id).
         card: the environment's card.
         estimator: reads states and masks from video of this environment; None if there is none.
-        branches: rollouts of other actions from the same first frame, each with the video that the
-            simulator makes of them as `target`; empty unless requested.
+        branches: predictions of other actions from the same first frame, each with the video that
+            the simulator makes of them as `target`; empty unless requested.
+        clip: which clip of an evaluation it is.
+        kind: what predicted it there, see `acwm_core.evaluation.clips.Predictor`.
+        ood_label: the factors of the episode that were shifted out of distribution, if any.
     """
 
-    prediction: Clip
-    target: Clip
+    video: shapes.Clip
+    target: shapes.Clip
     actions: NDArray[np.float32]
     states: Mapping[str, NDArray[Any]]
     masks: NDArray[np.uint8]
     contacts: NDArray[np.int32]
     card: EnvironmentCard
     estimator: StateEstimator | None = None
-    branches: tuple[Rollout, ...] = ()
+    branches: tuple[Prediction, ...] = ()
+    clip: Clip = field(default_factory=Clip)
+    kind: Predictor = "model"
+    ood_label: str | None = None
 
     @classmethod
     def of(
         cls,
         episode: Episode,
-        target: Clip,
-        prediction: Clip,
+        video: shapes.Clip,
+        target: shapes.Clip,
         card: EnvironmentCard,
         estimator: StateEstimator | None = None,
-    ) -> Rollout:
-        """Make a rollout from an episode, its video `target`, and a prediction of it."""
-        known = episode.actions, episode.states, episode.masks, episode.contacts
-        return cls(prediction, target, *known, card, estimator)
+    ) -> Prediction:
+        """A prediction of an episode, whose own video as a tensor is `target`."""
+        truth = episode.actions, episode.states, episode.masks, episode.contacts
+        return cls(video, target, *truth, card, estimator, ood_label=episode.ood_label)
+
+    def without(self, frames: int) -> Prediction:
+        """The prediction without its first `frames` frames, as if the clip had begun later."""
+        contacts = self.contacts - np.array([frames, 0, 0], self.contacts.dtype)
+        return replace(
+            self,
+            video=self.video[frames:],
+            target=self.target[frames:],
+            actions=self.actions[frames:],
+            states={name: values[frames:] for name, values in self.states.items()},
+            masks=self.masks[frames:],
+            contacts=contacts[contacts[:, 0] >= 0],
+            branches=tuple(branch.without(frames) for branch in self.branches),
+        )
 
     def check_shapes(self) -> None:
-        """Check that prediction and target can be compared.
-
-        Raises:
-            ShapeError: they differ in shape, or have no frames.
-        """
-        prediction, target = list(self.prediction.shape), list(self.target.shape)
-        if prediction != target or len(target) != 4 or not target[0]:
+        """Raise a `ShapeError` unless video and target have the same shape, with some frames."""
+        video, target = list(self.video.shape), list(self.target.shape)
+        if video != target or len(target) != 4 or not target[0]:
             raise ShapeError(
-                f"metrics compare two clips [T, 3, H, W] of one shape, not {prediction} with "
-                f"{target}"
+                f"metrics compare two clips [T, 3, H, W] of one shape, not {video} with {target}"
             )
 
     @functools.cached_property
     def observed(self) -> Observation:
-        """The estimator's reading of the prediction, computed once for all metrics.
+        """The estimator's reading of the video, computed once for all metrics.
 
         Raises:
             PluginError: there is no estimator; a metric that needs one must say so in
@@ -89,12 +105,12 @@ class Rollout:
         """
         if self.estimator is None:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
-        return self.estimator.read(self.prediction)
+        return self.estimator.read(self.video)
 
     @functools.cached_property
     def is_finite(self) -> bool:
-        """Whether the predictions of this rollout and all branches are free of NaN and infinity."""
-        own = bool(self.prediction.isfinite().all())
+        """Whether its video and those of all branches are free of NaN and infinity."""
+        own = bool(self.video.isfinite().all())
         return own and all(branch.is_finite for branch in self.branches)
 
     def once(self, key: object, work_out: Callable[[], Result]) -> Result:
@@ -177,7 +193,7 @@ class Metric(ABC):
 
         Args:
             card: the environment's card.
-            estimator: the later `Rollout.estimator`.
+            estimator: the later `Prediction.estimator`.
         """
         return None
 
@@ -186,34 +202,34 @@ class Metric(ABC):
         return {}
 
     @abstractmethod
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The score of each frame, `[T]`; NaN where it is not defined."""
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """The score of the whole clip; the mean over frames with a defined score unless overridden.
 
         NaN means not defined; the clip then counts in no summary. It is called only for finite
         predictions; others get the score `worst`.
         """
-        return mean_of_defined(self.per_frame(rollout))
+        return mean_of_defined(self.per_frame(prediction))
 
     @property
     def worst(self) -> float:
         """The score of a prediction that is not finite: infinitely bad."""
         return -math.inf if self.higher_is_better else math.inf
 
-    def weight(self, rollout: Rollout) -> float:
+    def weight(self, prediction: Prediction) -> float:
         """Weight of the clip in `summarise`; 1 unless overridden."""
         return 1.0
 
-    def curve(self, rollout: Rollout) -> NDArray[np.float64]:
+    def curve(self, prediction: Prediction) -> NDArray[np.float64]:
         """Call `per_frame`; `PluginError` unless the result has one number per frame."""
-        scores = np.asarray(self.per_frame(rollout), np.float64)
-        check_shape(self, "per_frame", scores, len(rollout.target))
+        scores = np.asarray(self.per_frame(prediction), np.float64)
+        check_shape(self, "per_frame", scores, len(prediction.target))
         return scores
 
     def scored(
-        self, rollout: Rollout, curve: NDArray[np.float64] | None = None
+        self, prediction: Prediction, curve: NDArray[np.float64] | None = None
     ) -> tuple[float, float]:
         """The value and weight of a clip; `worst` and 1 if the prediction is not finite.
 
@@ -223,13 +239,13 @@ class Metric(ABC):
         Raises:
             PluginError: the weight is negative or not finite.
         """
-        if not rollout.is_finite:
+        if not prediction.is_finite:
             return self.worst, 1.0
         if type(self).value is Metric.value:
-            value = mean_of_defined(self.curve(rollout) if curve is None else curve)
+            value = mean_of_defined(self.curve(prediction) if curve is None else curve)
         else:
-            value = float(self.value(rollout))
-        weight = float(self.weight(rollout))
+            value = float(self.value(prediction))
+        weight = float(self.weight(prediction))
         if not 0 <= weight < math.inf:
             raise PluginError(f"{type(self).__name__}.weight gives {weight}, not at least 0")
         return value, weight
@@ -257,7 +273,7 @@ class SetMetric(Metric):
     """
 
     @abstractmethod
-    def features(self, rollout: Rollout) -> NDArray[np.float32]:
+    def features(self, prediction: Prediction) -> NDArray[np.float32]:
         """Features of a clip: a vector for the prediction and one for the target, `[2, D]`."""
 
     @abstractmethod
@@ -272,9 +288,9 @@ class SetMetric(Metric):
         with noting(f"in metric {self.name!r} as it sums clips up", self):
             return float(self.distance(np.asarray(clips, np.float32)))
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """All NaN, `[T]`: single frames have no score."""
-        return np.full(len(rollout.target), np.nan)
+        return np.full(len(prediction.target), np.nan)
 
 
 def mean_of_defined(scores: NDArray[np.float64]) -> float:

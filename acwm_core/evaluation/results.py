@@ -1,4 +1,4 @@
-"""The summary of an evaluation: ``summary.json``."""
+"""What an evaluation finds: the `Score` of each clip, and their `Summary`, ``summary.json``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pydantic import AliasChoices, Field
 from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import Published
-from acwm_core.evaluation.facts import Environment, Name, Provenance, VideoFile
 from acwm_core.evaluation.metric import MetricInfo as MetricInfo
 from acwm_core.evaluation.statistics import Estimate as Estimate
 from acwm_core.evaluation.statistics import Paired as Paired
@@ -22,9 +21,44 @@ FOLDER = "evaluation"
 SUMMARY = "summary.json"
 VIDEOS = "videos"
 
+VideoFile = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+=-]*\.mp4$", max_length=200)]
+"""The name of a video in the folder of a run's videos, never a path."""
+
 
 @dataclass(frozen=True)
-class Scores:
+class Score:
+    """How well one row predicted one clip: a row of ``episodes.parquet``.
+
+    Attributes:
+        split: test split.
+        episode: number of the episode within the split.
+        start: the episode's frame with which the clip starts.
+        ood_label: the factor that was shifted, if any.
+        kind: the row, see `acwm_core.evaluation.clips.Predictor`.
+        frames: number of frames that are scored.
+        values: the score of the clip, by metric; NaN where it is not defined.
+        weights: how much the clip counts in a metric's summary, by metric.
+        curves: the score of each frame, by metric; NaN where it is not defined. Rounded to float32,
+            as they are written.
+        features: features `[2, D]` of each `SetMetric`.
+        failed: whether the prediction is not finite; then all scores are `Metric.worst`.
+    """
+
+    split: str
+    episode: int
+    start: int
+    ood_label: str | None
+    kind: str
+    frames: int
+    values: dict[str, float]
+    weights: dict[str, float]
+    curves: dict[str, list[float]]
+    features: dict[str, list[list[float]]] = field(default_factory=dict[str, list[list[float]]])
+    failed: bool = False
+
+
+@dataclass(frozen=True)
+class SetSummary:
     """The scores of a set of clips.
 
     Attributes:
@@ -37,8 +71,8 @@ class Scores:
     """
 
     clips: int
-    rows: dict[Name, dict[Name, Estimate]]
-    paired: dict[Name, dict[Name, Paired]]
+    rows: dict[str, dict[str, Estimate]]
+    paired: dict[str, dict[str, Paired]]
     episodes: int = 0
     failed: dict[str, int] = field(default_factory=dict[str, int])
     undefined: dict[str, int] = field(default_factory=dict[str, int])
@@ -124,11 +158,11 @@ class Counterfactual:
     clips: int
     frames: int
     branches: int
-    rows: dict[Name, dict[Name, Estimate]]
-    kinds: dict[str, dict[Name, dict[Name, Estimate]]]
-    gain: dict[str, dict[Name, float | None]]
+    rows: dict[str, dict[str, Estimate]]
+    kinds: dict[str, dict[str, dict[str, Estimate]]]
+    gain: dict[str, dict[str, float | None]]
     residual: Annotated[
-        dict[str, dict[Name, float | None]],
+        dict[str, dict[str, float | None]],
         Field(validation_alias=AliasChoices("residual", "stray")),  # its former name
     ]
     curves: list[ResponseCurve]
@@ -169,9 +203,9 @@ class SplitSummary:
         predictability: the predictability horizon; likewise.
     """
 
-    scores: Scores
-    labels: dict[str, Scores]
-    horizon: dict[Name, dict[Name, list[float | None]]]
+    scores: SetSummary
+    labels: dict[str, SetSummary]
+    horizon: dict[str, dict[str, list[float | None]]]
     steps: StepsCurve | None = None
     counterfactual: Counterfactual | None = None
     predictability: Predictability | None = None
@@ -196,7 +230,7 @@ class VideoRecord:
     """
 
     file: VideoFile
-    split: Name
+    split: str
     episode: int
     ood_label: str | None
     pick: str
@@ -228,13 +262,13 @@ class Summary:
 
     run: str
     parts: dict[str, str]
-    metrics: dict[Name, MetricInfo]
-    headline: Name
-    splits: dict[Name, SplitSummary]
+    metrics: dict[str, MetricInfo]
+    headline: str
+    splits: dict[str, SplitSummary]
     gap: dict[str, dict[str, Estimate]]
-    environment: Environment
+    environment: dict[str, Any]
     videos: list[VideoRecord] = field(default_factory=list[VideoRecord])
-    provenance: Provenance = field(default_factory=dict[str, Any])
+    provenance: dict[str, Any] = field(default_factory=dict[str, Any])
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
     published: Published | None = None

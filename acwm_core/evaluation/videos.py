@@ -1,13 +1,20 @@
-"""Videos of truth, prediction and difference, side by side."""
+"""Videos of truth, prediction and difference, side by side, and which clips are shown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.results import Score, VideoRecord
+from acwm_core.evaluation.statistics import finite
 from acwm_core.model.shapes import Clip
+
+ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
+"""A record and its frames `[T, H, W, 3]`."""
 
 PANEL = 256
 """Approximate height of a panel in pixels; frames are magnified by a whole factor."""
@@ -26,6 +33,50 @@ REPORT_PANEL = 128
 
 _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
 _HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
+
+
+def shown(
+    prediction: Prediction,
+    file: str,
+    *,
+    kind: str,
+    pick: str,
+    actions: NDArray[np.float32],
+    values: Mapping[str, float] | None = None,
+) -> ShownClip:
+    """The video of a prediction and its record, see `VideoRecord`."""
+    panels, frames = case_study(prediction.target, prediction.video, prediction.masks)
+    clip = prediction.clip
+    return VideoRecord(
+        file=file,
+        split=clip.split,
+        episode=clip.episode,
+        start=clip.start,
+        ood_label=prediction.ood_label,
+        pick=pick,
+        kind=kind,
+        values={name: finite(value) for name, value in (values or {}).items()},
+        actions=actions.tolist(),
+        panels=panels,
+    ), frames
+
+
+def pick_clips(
+    scores: Sequence[Score], metric: str, higher_is_better: bool, count: int
+) -> dict[tuple[int, int], str]:
+    """The clips to show, best first: ``best``, ``median`` or ``worst`` by episode and start.
+
+    Takes `count` of each, or fewer in a small split, ranked by the model's score in `metric`.
+    """
+    sign = -1 if higher_is_better else 1
+    rows = [s for s in scores if s.kind == "model" and not math.isnan(s.values[metric])]
+    rows.sort(key=lambda s: (sign * s.values[metric], s.episode, s.start))
+    ranked = [(s.episode, s.start) for s in rows]
+    middle = max(0, (len(ranked) - count) // 2)
+    picks = dict.fromkeys(ranked[middle : middle + count], "median")
+    picks |= dict.fromkeys(ranked[len(ranked) - count :], "worst")
+    picks |= dict.fromkeys(ranked[:count], "best")
+    return {place: picks[place] for place in ranked if place in picks}
 
 
 def case_study(

@@ -18,7 +18,7 @@ from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import DataError, RecipeError, noting, suggest
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
 from acwm_core.plugins import catalog

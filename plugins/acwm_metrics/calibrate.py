@@ -23,7 +23,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.physics import Gap, StateEstimator
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_core.plugins import catalog
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts
@@ -49,29 +49,29 @@ than the calibration videos suggested."""
 Signal = NDArray[np.float64]
 
 
-def calibrate(rollouts: Sequence[Rollout]) -> dict[str, float]:
+def calibrate(predictions: Sequence[Prediction]) -> dict[str, float]:
     """Compute the limits of an environment, by name.
 
     Args:
-        rollouts: true videos, used as predictions of themselves.
+        predictions: true videos, used as predictions of themselves.
     """
-    physics = physics_of(rollouts[0])
+    physics = physics_of(predictions[0])
     limits = {
         each.name: WIDE_MARGIN
-        * worst([largest_lasting(np.abs(change(each, r)), each.lasting) for r in rollouts])
+        * worst([largest_lasting(np.abs(change(each, r)), each.lasting) for r in predictions])
         for each in physics.constants
     }
     limits = {name: max(value, MIN_TOLERANCE["constant"]) for name, value in limits.items()}
     if physics.objects:
-        longest = worst([longest_run(~seen_once(r)) for r in rollouts])
+        longest = worst([longest_run(~seen_once(r)) for r in predictions])
         limits["objects.lasting"] = max(LASTING, int(WIDE_MARGIN * longest) + 1)
-        hidden = worst([max(map(longest_run, out_of_sight(r).T)) for r in rollouts])
+        hidden = worst([max(map(longest_run, out_of_sight(r).T)) for r in predictions])
         limits["objects.unseen"] = max(LASTING, int(MARGIN * hidden) + 1)
     kinds: dict[str, list[Gap]] = defaultdict(list)
     for gap in physics.gaps:
         kinds[gap.name].append(gap)
     for name, gaps in kinds.items():
-        pairs = [(measured(gap, r), true_contacts(r, gap)) for gap in gaps for r in rollouts]
+        pairs = [(measured(gap, r), true_contacts(r, gap)) for gap in gaps for r in predictions]
         if gaps[0].solid is not None:
             depths = np.reshape(
                 [largest_lasting(-distance) for distance, _ in pairs], (len(gaps), -1)
@@ -127,19 +127,21 @@ def f1_score(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) ->
     return 2 * right / max(found + true, 1)
 
 
-def true_rollout(episode: Episode, card: EnvironmentCard, estimator: StateEstimator) -> Rollout:
+def true_prediction(
+    episode: Episode, card: EnvironmentCard, estimator: StateEstimator
+) -> Prediction:
     """Use an episode's own video as its prediction."""
     video = as_clip(episode.video)
-    return Rollout.of(episode, video, video, card, estimator)
+    return Prediction.of(episode, video, video, card, estimator)
 
 
-def _rollouts(folder: Path, most: int) -> Iterator[Rollout]:
+def _predictions(folder: Path, most: int) -> Iterator[Prediction]:
     card = DatasetCard.read(folder)
     estimator = catalog().create("estimator", card.environment.name, card=card.environment)
     for split in card.splits:
         episodes = EpisodeDataset(folder, cast(Split, split))
         for index in range(min(most, len(episodes))):
-            yield true_rollout(episodes[index], card.environment, estimator)
+            yield true_prediction(episodes[index], card.environment, estimator)
 
 
 def main() -> None:
@@ -149,12 +151,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file, changed in place")
     parser.add_argument("--clips", type=int, default=160, help="episodes per split, at most")
     options = parser.parse_args()
-    by_world: dict[str, list[Rollout]] = defaultdict(list)
+    by_world: dict[str, list[Prediction]] = defaultdict(list)
     for folder in options.data:
-        for rollout in _rollouts(folder, options.clips):
-            by_world[rollout.card.name].append(rollout)
+        for prediction in _predictions(folder, options.clips):
+            by_world[prediction.card.name].append(prediction)
     limits = json.loads(options.out.read_text("utf-8")) if options.out.exists() else {}
-    limits |= {name: calibrate(rollouts) for name, rollouts in by_world.items()}
+    limits |= {name: calibrate(predictions) for name, predictions in by_world.items()}
     options.out.write_text(json.dumps(limits, indent=1, sort_keys=True) + "\n", "utf-8")
 
 

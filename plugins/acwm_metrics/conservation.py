@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.physics import Constant, Physics
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import (
     PhysicalMetric,
     measured,
@@ -39,9 +39,9 @@ class Permanence(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs objects."""
         return None if physics.objects else "no objects to track"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """1 for a frame in which every object is there once, else 0, `[T]`."""
-        return seen_once(rollout).astype(np.float64)
+        return seen_once(prediction).astype(np.float64)
 
 
 class LengthError(PhysicalMetric):
@@ -58,10 +58,10 @@ class LengthError(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs conserved lengths (or amounts)."""
         return None if _of(physics, self.kind) else f"no {self.kind} that is conserved"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The mean over all lengths (or amounts) in each frame, `[T]`; 0.1 is 10 %."""
-        constants = _of(physics_of(rollout), self.kind)
-        return row_means(np.abs(np.stack([change(each, rollout) for each in constants], 1)))
+        constants = _of(physics_of(prediction), self.kind)
+        return row_means(np.abs(np.stack([change(each, prediction) for each in constants], 1)))
 
 
 class AmountError(LengthError):
@@ -82,10 +82,10 @@ class Penetration(PhysicalMetric):
         solid = any(gap.solid is not None for gap in physics.gaps)
         return None if solid else "no two solid bodies whose distance is read"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The depth in each frame, `[T]`, in m; 0 where nothing overlaps."""
-        gaps = [gap for gap in physics_of(rollout).gaps if gap.solid is not None]
-        depths = np.stack([-measured(gap, rollout) for gap in gaps], 1)
+        gaps = [gap for gap in physics_of(prediction).gaps if gap.solid is not None]
+        depths = np.stack([-measured(gap, prediction) for gap in gaps], 1)
         deepest = np.where(np.isnan(depths), -np.inf, depths).max(1)
         return np.where(np.isnan(depths).all(1), np.nan, np.maximum(deepest, 0.0))
 
@@ -110,52 +110,54 @@ class Violations(PhysicalMetric):
         )
         return None if some else "nothing that is conserved"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """1 for a frame with a violation, else 0, `[T]`."""
-        none = np.zeros(len(rollout.prediction), np.bool_)
-        return np.any([none, *violations(rollout).values()], axis=0).astype(np.float64)
+        none = np.zeros(len(prediction.video), np.bool_)
+        return np.any([none, *violations(prediction).values()], axis=0).astype(np.float64)
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """1 if any frame has a violation, else 0."""
-        return float(self.per_frame(rollout).max())
+        return float(self.per_frame(prediction).max())
 
 
-def violations(rollout: Rollout) -> dict[str, NDArray[np.bool_]]:
+def violations(prediction: Prediction) -> dict[str, NDArray[np.bool_]]:
     """Flags of the frames with a violation, `[T]`, by kind of violation.
 
     The kinds are ``permanence``, the names of constants, and ``a in b`` for solid bodies. A
     prediction that only repeats the true first frame has no violations, even if the estimator
     misreads that frame.
     """
-    physics = physics_of(rollout)
+    physics = physics_of(prediction)
     found: dict[str, NDArray[np.bool_]] = {}
-    if repeats_first_frame(rollout):
+    if repeats_first_frame(prediction):
         return found
     if physics.objects:
-        gone = [lasting(unseen, physics.unseen) for unseen in out_of_sight(rollout).T]
-        found["permanence"] = np.any([lasting(~seen_once(rollout), physics.lasting), *gone], axis=0)
+        gone = [lasting(unseen, physics.unseen) for unseen in out_of_sight(prediction).T]
+        found["permanence"] = np.any(
+            [lasting(~seen_once(prediction), physics.lasting), *gone], axis=0
+        )
     for constant in physics.constants:
-        off = np.abs(change(constant, rollout)) > constant.tolerance
+        off = np.abs(change(constant, prediction)) > constant.tolerance
         found[constant.name] = lasting(off, constant.lasting)
     for gap in physics.gaps:
         if gap.solid is not None:
-            found[" in ".join(gap.pair)] = lasting(-measured(gap, rollout) > gap.solid)
+            found[" in ".join(gap.pair)] = lasting(-measured(gap, prediction) > gap.solid)
     return found
 
 
-def repeats_first_frame(rollout: Rollout) -> bool:
+def repeats_first_frame(prediction: Prediction) -> bool:
     """Whether the prediction is the true first frame and nothing else."""
-    return bool((rollout.prediction == rollout.target[:1]).all())
+    return bool((prediction.video == prediction.target[:1]).all())
 
 
-def change(constant: Constant, rollout: Rollout) -> NDArray[np.float64]:
+def change(constant: Constant, prediction: Prediction) -> NDArray[np.float64]:
     """The relative error of a constant in each frame of the prediction, `[T]`.
 
     It is relative to the median of the true values, because elastic things stretch a little.
     """
-    true = constant.measure(truth_of(rollout), start_of(rollout))
+    true = constant.measure(truth_of(prediction), start_of(prediction))
     true = true[np.isfinite(true)]
-    return measured(constant, rollout) / (np.median(true) if len(true) else np.nan) - 1
+    return measured(constant, prediction) / (np.median(true) if len(true) else np.nan) - 1
 
 
 def lasting(flags: NDArray[np.bool_], frames: float = LASTING) -> NDArray[np.bool_]:

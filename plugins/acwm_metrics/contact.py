@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.physics import Gap, Physics
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, instance_id, measured, physics_of
 
 WINDOW = 5
@@ -50,29 +50,29 @@ class ContactMetric(PhysicalMetric):
         told = any(gap.touch is not None for gap in physics.gaps)
         return None if told else "no contacts that can be detected"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The mean over the events in each frame, `[T]`; NaN for a frame without events."""
-        frames, scores = self._events(rollout)
-        sums = np.bincount(frames, scores, len(rollout.masks))
-        events = np.bincount(frames, minlength=len(rollout.masks))
+        frames, scores = self._events(prediction)
+        sums = np.bincount(frames, scores, len(prediction.masks))
+        events = np.bincount(frames, minlength=len(prediction.masks))
         return np.where(events > 0, sums / np.maximum(events, 1), np.nan)
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """The mean over all events of the clip; NaN if it has none."""
-        scores = self._events(rollout)[1]
+        scores = self._events(prediction)[1]
         return float(scores.mean()) if len(scores) else float("nan")
 
-    def weight(self, rollout: Rollout) -> float:
+    def weight(self, prediction: Prediction) -> float:
         """The number of events."""
-        return float(len(self._events(rollout)[1]))
+        return float(len(self._events(prediction)[1]))
 
-    def _events(self, rollout: Rollout) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _events(self, prediction: Prediction) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Frames and scores of all events."""
-        found = [(f, s) for each in onsets(rollout) for f, s in self._scored(each, rollout)]
+        found = [(f, s) for each in onsets(prediction) for f, s in self._scored(each, prediction)]
         frames, scores = zip(*found, strict=True) if found else ((), ())
         return np.array(frames, np.int64), np.array(scores, np.float64)
 
-    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+    def _scored(self, onsets: Onsets, prediction: Prediction) -> Iterator[tuple[int, float]]:
         raise NotImplementedError
 
 
@@ -83,7 +83,7 @@ class ContactPrecision(ContactMetric):
     bounds = (0.0, 1.0)
     higher_is_better = True
 
-    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+    def _scored(self, onsets: Onsets, prediction: Prediction) -> Iterator[tuple[int, float]]:
         right = {seen for seen, _ in onsets.pairs}
         return ((int(f), float(k in right)) for k, f in enumerate(onsets.seen))
 
@@ -95,7 +95,7 @@ class ContactRecall(ContactMetric):
     bounds = (0.0, 1.0)
     higher_is_better = True
 
-    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+    def _scored(self, onsets: Onsets, prediction: Prediction) -> Iterator[tuple[int, float]]:
         found = {true for _, true in onsets.pairs}
         return ((int(f), float(k in found)) for k, f in enumerate(onsets.true))
 
@@ -106,13 +106,13 @@ class ContactTiming(ContactMetric):
     name = "contact_timing"
     unit = "s"
 
-    def _scored(self, onsets: Onsets, rollout: Rollout) -> Iterator[tuple[int, float]]:
+    def _scored(self, onsets: Onsets, prediction: Prediction) -> Iterator[tuple[int, float]]:
         for seen, true in onsets.pairs:
             off = abs(int(onsets.seen[seen]) - int(onsets.true[true]))
-            yield int(onsets.true[true]), off * self._frame(rollout)
+            yield int(onsets.true[true]), off * self._frame(prediction)
 
-    def _frame(self, rollout: Rollout) -> float:
-        return 1 / rollout.card.fps
+    def _frame(self, prediction: Prediction) -> float:
+        return 1 / prediction.card.fps
 
 
 class ContactTimingInFrames(ContactTiming):
@@ -121,29 +121,29 @@ class ContactTimingInFrames(ContactTiming):
     name = "contact_timing_frames"
     unit = "frames"
 
-    def _frame(self, rollout: Rollout) -> float:
+    def _frame(self, prediction: Prediction) -> float:
         return 1.0
 
 
-def onsets(rollout: Rollout) -> list[Onsets]:
+def onsets(prediction: Prediction) -> list[Onsets]:
     """The contact onsets of every pair of bodies, in prediction and truth."""
-    return rollout.once(onsets, lambda: list(_onsets(rollout)))
+    return prediction.once(onsets, lambda: list(_onsets(prediction)))
 
 
-def _onsets(rollout: Rollout) -> Iterator[Onsets]:
-    for gap in physics_of(rollout).gaps:
+def _onsets(prediction: Prediction) -> Iterator[Onsets]:
+    for gap in physics_of(prediction).gaps:
         if gap.touch is None:
             continue
-        seen = beginnings(measured(gap, rollout) < gap.touch)
-        true = beginnings(true_contacts(rollout, gap))
+        seen = beginnings(measured(gap, prediction) < gap.touch)
+        true = beginnings(true_contacts(prediction, gap))
         yield Onsets(seen, true, matched(seen, true))
 
 
-def true_contacts(rollout: Rollout, gap: Gap) -> NDArray[np.bool_]:
+def true_contacts(prediction: Prediction, gap: Gap) -> NDArray[np.bool_]:
     """Whether two bodies touch in the simulator in each frame, `[T]`."""
-    pair = sorted(instance_id(rollout, name) for name in gap.pair)
-    rows = rollout.contacts[(rollout.contacts[:, 1:] == pair).all(1)]
-    touching = np.zeros(len(rollout.masks), np.bool_)
+    pair = sorted(instance_id(prediction, name) for name in gap.pair)
+    rows = prediction.contacts[(prediction.contacts[:, 1:] == pair).all(1)]
+    touching = np.zeros(len(prediction.masks), np.bool_)
     touching[rows[:, 0]] = True
     return touching
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
-from acwm_core.evaluation.metric import Rollout, SetMetric
+from acwm_core.evaluation.metric import Prediction, SetMetric
 from acwm_core.model.shapes import Clip
 from acwm_metrics.networks import fingerprint
 
@@ -64,10 +64,10 @@ class FVD(SetMetric):
         """The hash of the detector file."""
         return {"detector": fingerprint(self.file)} if self.file else {}
 
-    def features(self, rollout: Rollout) -> NDArray[np.float32]:
+    def features(self, prediction: Prediction) -> NDArray[np.float32]:
         """Features of prediction and target, `[2, D]`."""
-        rollout.check_shapes()
-        pair = (rollout.prediction, rollout.target)
+        prediction.check_shapes()
+        pair = (prediction.video, prediction.target)
         return np.stack([self._features(clip)[0].float().numpy() for clip in pair])
 
     def distance(self, features: NDArray[np.float32]) -> float:

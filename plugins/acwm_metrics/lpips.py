@@ -18,7 +18,7 @@ from torch import Tensor
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_metrics.networks import fingerprint, read_tensors
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -146,10 +146,10 @@ class LPIPS(Metric):
         hashes = {"backbone": fingerprint(self.backbone), "heads": fingerprint(self.heads)}
         return {"network": self.network, **hashes}
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`; 0 for equal frames."""
-        rollout.check_shapes()
-        clips = (clip.detach().cpu().float() for clip in (rollout.prediction, rollout.target))
+        prediction.check_shapes()
+        clips = (clip.detach().cpu().float() for clip in (prediction.video, prediction.target))
         chunks = zip(*(clip.split(CHUNK) for clip in clips), strict=True)
         with torch.inference_mode():
             return np.concatenate([self._distances(*pair).double().numpy() for pair in chunks])

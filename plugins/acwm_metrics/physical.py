@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Constant, Gap, Level, Observation, Physics, StateEstimator, States
 from acwm_core.errors import PluginError
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 
 
 class PhysicalMetric(Metric):
@@ -37,36 +37,36 @@ class PhysicalMetric(Metric):
         """What an environment lacks for this metric, such as "no contacts"; None for nothing."""
 
 
-def physics_of(rollout: Rollout) -> Physics:
+def physics_of(prediction: Prediction) -> Physics:
     """What can be measured in a clip.
 
     Raises:
         PluginError: no estimator was given.
     """
-    if rollout.estimator is None:
-        raise PluginError(f"no estimator reads the video of {rollout.card.name}")
-    return rollout.estimator.physics
+    if prediction.estimator is None:
+        raise PluginError(f"no estimator reads the video of {prediction.card.name}")
+    return prediction.estimator.physics
 
 
-def truth_of(rollout: Rollout) -> Observation:
+def truth_of(prediction: Prediction) -> Observation:
     """The simulator's truth, in the form of an observation."""
-    return Observation(rollout.masks, rollout.states)
+    return Observation(prediction.masks, prediction.states)
 
 
-def start_of(rollout: Rollout) -> States:
+def start_of(prediction: Prediction) -> States:
     """The simulator's states in the first frame."""
-    return {name: values[0] for name, values in rollout.states.items()}
+    return {name: values[0] for name, values in prediction.states.items()}
 
 
-def measured(quantity: Constant | Gap | Level, rollout: Rollout) -> NDArray[np.float64]:
+def measured(quantity: Constant | Gap | Level, prediction: Prediction) -> NDArray[np.float64]:
     """A quantity in each frame of the prediction; see `Measure`."""
     key = ("measured", quantity.measure)
-    return rollout.once(key, lambda: quantity.measure(rollout.observed, start_of(rollout)))
+    return prediction.once(key, lambda: quantity.measure(prediction.observed, start_of(prediction)))
 
 
-def instance_id(rollout: Rollout, name: str) -> int:
+def instance_id(prediction: Prediction, name: str) -> int:
     """The id of an instance in masks and contacts."""
-    return rollout.card.instances.index(name)
+    return prediction.card.instances.index(name)
 
 
 def row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.errors import ShapeError
-from acwm_core.evaluation.metric import Metric, Numbers, Rollout
+from acwm_core.evaluation.metric import Metric, Numbers, Prediction
 from acwm_core.model.shapes import Clip
 
 MOTION_FLOOR = 0.01
@@ -39,9 +39,9 @@ class MSE(Metric):
     reads = "pixels"
     factor = 1000.0
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The error of each frame, `[T]`."""
-        return _squared_error(rollout).mean((1, 2), dtype=np.float64)
+        return _squared_error(prediction).mean((1, 2), dtype=np.float64)
 
 
 class MaskedMSE(Metric):
@@ -59,14 +59,14 @@ class MaskedMSE(Metric):
     reads = "pixels"
     factor = 1000.0
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The weighted error of each frame, `[T]`."""
-        errors, weights = _squared_error(rollout), _weights_of(rollout)
+        errors, weights = _squared_error(prediction), _weights_of(prediction)
         return np.einsum("thw,hw->t", errors, weights, dtype=np.float64) / weights.sum()
 
-    def weight(self, rollout: Rollout) -> float:
+    def weight(self, prediction: Prediction) -> float:
         """Σ w over all frames of the clip: clips with more motion weigh more."""
-        return float(_weights_of(rollout).sum() * len(rollout.target))
+        return float(_weights_of(prediction).sum() * len(prediction.target))
 
 
 class PSNR(Metric):
@@ -84,13 +84,13 @@ class PSNR(Metric):
     reads = "pixels"
     rank = 10
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """PSNR of each frame, `[T]`, in dB."""
-        return decibels(MSE().per_frame(rollout))
+        return decibels(MSE().per_frame(prediction))
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """PSNR of the whole clip, from its MSE, in dB."""
-        return float(decibels(MSE().value(rollout)))
+        return float(decibels(MSE().value(prediction)))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
         """PSNR of many clips, from their mean MSE, in dB."""
@@ -125,32 +125,27 @@ class SSIM(Metric):
     group = "Pixels"
     reads = "pixels"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """SSIM of each frame, `[T]`, in [-1, 1].
 
         Raises:
             ShapeError: the frames are smaller than the window.
         """
-        rollout.check_shapes()
-        prediction, target = (
-            clip.detach().cpu().numpy() for clip in (rollout.prediction, rollout.target)
-        )
-        height, width = target.shape[2:]
+        prediction.check_shapes()
+        pair = prediction.video, prediction.target
+        made, true = (clip.detach().cpu().numpy() for clip in pair)
+        height, width = true.shape[2:]
         if min(height, width) < WINDOW:
             raise ShapeError(f"SSIM needs frames of at least 7×7 pixels, not {height}×{width}")
-        return np.array([similarity(*pair) for pair in zip(target, prediction, strict=True)])
+        return np.array([similarity(*pair) for pair in zip(true, made, strict=True)])
 
 
-def videos(rollout: Rollout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Prediction and target, each `[T, 3, H, W]` in double precision.
-
-    Raises:
-        ShapeError: the two differ in shape, or have no frames.
-    """
-    rollout.check_shapes()
-    clips = (clip.detach().cpu().double().numpy() for clip in (rollout.prediction, rollout.target))
-    prediction, target = clips
-    return prediction, target
+def videos(prediction: Prediction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Prediction and target, each `[T, 3, H, W]` in double precision."""
+    prediction.check_shapes()
+    pair = prediction.video, prediction.target
+    made, true = (clip.detach().cpu().double().numpy() for clip in pair)
+    return made, true
 
 
 def motion_weights(target: Clip) -> NDArray[np.float64]:
@@ -161,21 +156,21 @@ def motion_weights(target: Clip) -> NDArray[np.float64]:
     return MOTION_FLOOR + moved.double().numpy()
 
 
-def _squared_error(rollout: Rollout) -> NDArray[np.float32]:
-    """Squared error of each pixel, mean over channels, `[T, H, W]`; computed once per rollout."""
+def _squared_error(prediction: Prediction) -> NDArray[np.float32]:
+    """Squared error of each pixel, mean over channels, `[T, H, W]`; computed once."""
 
     def work_out() -> NDArray[np.float32]:
-        rollout.check_shapes()
-        pair = rollout.prediction, rollout.target
-        prediction, target = (clip.detach().cpu().float() for clip in pair)
-        return (prediction - target).square_().mean(1).numpy()
+        prediction.check_shapes()
+        pair = prediction.video, prediction.target
+        made, true = (clip.detach().cpu().float() for clip in pair)
+        return (made - true).square_().mean(1).numpy()
 
-    return rollout.once(_squared_error, work_out)
+    return prediction.once(_squared_error, work_out)
 
 
-def _weights_of(rollout: Rollout) -> NDArray[np.float64]:
-    """`motion_weights` of a clip's target, computed once per rollout."""
-    return rollout.once(motion_weights, lambda: motion_weights(rollout.target))
+def _weights_of(prediction: Prediction) -> NDArray[np.float64]:
+    """`motion_weights` of a clip's target, computed once per prediction."""
+    return prediction.once(motion_weights, lambda: motion_weights(prediction.target))
 
 
 def decibels(error: NDArray[np.float64] | float) -> NDArray[np.float64]:

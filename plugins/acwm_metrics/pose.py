@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.physics import Physics, Reading, Symmetry
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import (
     PhysicalMetric,
     physics_of,
@@ -35,9 +35,9 @@ class PositionError(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs positions."""
         return None if _of(physics, "position", "curve") else "no position that is read"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in m."""
-        return _mean_over_rows(rollout, _of(physics_of(rollout), "position", "curve"))
+        return _mean_over_rows(prediction, _of(physics_of(prediction), "position", "curve"))
 
 
 class OrientationError(PhysicalMetric):
@@ -54,9 +54,9 @@ class OrientationError(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs angles or orientations."""
         return None if _of(physics, "angle", "quaternion") else "no angle that is read"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The angle in each frame, `[T]`, in rad."""
-        return _mean_over_rows(rollout, _of(physics_of(rollout), "angle", "quaternion"))
+        return _mean_over_rows(prediction, _of(physics_of(prediction), "angle", "quaternion"))
 
 
 class PixelPositionError(PositionError):
@@ -66,10 +66,10 @@ class PixelPositionError(PositionError):
     title = "Position error (px)"
     unit = "px"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in pixels."""
-        readings = _of(physics_of(rollout), "position", "curve")
-        return _mean_over_rows(rollout, readings, in_pixels=True)
+        readings = _of(physics_of(prediction), "position", "curve")
+        return _mean_over_rows(prediction, readings, in_pixels=True)
 
 
 def _of(physics: Physics, *kinds: str) -> list[Reading]:
@@ -77,16 +77,16 @@ def _of(physics: Physics, *kinds: str) -> list[Reading]:
 
 
 def _mean_over_rows(
-    rollout: Rollout, readings: list[Reading], *, in_pixels: bool = False
+    prediction: Prediction, readings: list[Reading], *, in_pixels: bool = False
 ) -> NDArray[np.float64]:
-    return row_means(np.concatenate([_errors(rollout, each, in_pixels) for each in readings], 1))
+    return row_means(np.concatenate([_errors(prediction, each, in_pixels) for each in readings], 1))
 
 
-def _errors(rollout: Rollout, reading: Reading, in_pixels: bool) -> NDArray[np.float64]:
+def _errors(prediction: Prediction, reading: Reading, in_pixels: bool) -> NDArray[np.float64]:
     """Error of each row of a reading, `[T, n]`; NaN for rows that do not exist."""
-    seen, true = reading.of(rollout.observed.states), reading.of(rollout.states)
-    if in_pixels and rollout.estimator is not None:
-        seen, true = (rollout.estimator.pixels(reading.field, each) for each in (seen, true))
+    seen, true = reading.of(prediction.observed.states), reading.of(prediction.states)
+    if in_pixels and prediction.estimator is not None:
+        seen, true = (prediction.estimator.pixels(reading.field, each) for each in (seen, true))
     if reading.kind == "curve":
         ways = [np.linalg.norm(seen - each, axis=-1).mean(1) for each in (true, true[:, ::-1])]
         return np.minimum(*ways)[:, None]
@@ -98,7 +98,7 @@ def _errors(rollout: Rollout, reading: Reading, in_pixels: bool) -> NDArray[np.f
         errors = np.linalg.norm(seen - true, axis=-1)
     errors = errors.reshape(len(errors), -1)
     if reading.present:
-        there = np.asarray(rollout.states[reading.present]).reshape(errors.shape) > 0
+        there = np.asarray(prediction.states[reading.present]).reshape(errors.shape) > 0
         errors = np.where(there, errors, np.nan)
     return errors
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import instance_id, physics_of
 from acwm_metrics.shape import counts
 
@@ -27,20 +27,22 @@ _NEIGHBOURS = np.ones((3, 3), np.int64)
 _IN_FRAME = np.stack([0 * _NEIGHBOURS, _NEIGHBOURS, 0 * _NEIGHBOURS])
 
 
-def seen_once(rollout: Rollout) -> Mask:
+def seen_once(prediction: Prediction) -> Mask:
     """Whether every object is there once in each frame, `[T]`."""
-    return rollout.once(seen_once, lambda: np.logical_and.reduce(list(presence(rollout).values())))
+    return prediction.once(
+        seen_once, lambda: np.logical_and.reduce(list(presence(prediction).values()))
+    )
 
 
-def presence(rollout: Rollout) -> dict[str, Mask]:
+def presence(prediction: Prediction) -> dict[str, Mask]:
     """Whether each object is correctly present or absent in each frame, `[T]`, by name.
 
     An object of the episode must be seen in one piece, unless something is in front of it or it
     extends beyond the frame. An object that the episode does not have must not be seen.
     """
-    physics, masks = physics_of(rollout), rollout.observed.masks
-    ids, areas, sizes = _areas(rollout)
-    before = np.array([*ids, *(instance_id(rollout, name) for name in physics.shapes)])
+    physics, masks = physics_of(prediction), prediction.observed.masks
+    ids, areas, sizes = _areas(prediction)
+    before = np.array([*ids, *(instance_id(prediction, name) for name in physics.shapes)])
     exist = sizes > 0
     least = MIN_SHARE * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
     movable = {name for reading in physics.readings for name in reading.instances}
@@ -49,7 +51,7 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
         seen = areas[:, k] >= least[k]
         if exist[k]:
             others = before[before != instance]
-            first = rollout.masks[0] == instance
+            first = prediction.masks[0] == instance
             found[name] = seen | hidden(masks, int(instance), seen, others, first)
             if name in movable:
                 much = MOSTLY * float(sizes[k])
@@ -60,21 +62,21 @@ def presence(rollout: Rollout) -> dict[str, Mask]:
     return found
 
 
-def out_of_sight(rollout: Rollout) -> Mask:
+def out_of_sight(prediction: Prediction) -> Mask:
     """Whether each object of the episode is not seen, hidden or missing, `[T, objects]`."""
-    _, areas, sizes = _areas(rollout)
+    _, areas, sizes = _areas(prediction)
     return (areas < MIN_SHARE * sizes) & (sizes > 0)
 
 
 def _areas(
-    rollout: Rollout,
+    prediction: Prediction,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Ids `[n]` of all objects, their areas in the prediction `[T, n]`, and usual areas `[n]`."""
-    names = physics_of(rollout).objects
-    ids = np.array([instance_id(rollout, name) for name in names])
-    return rollout.once(
+    names = physics_of(prediction).objects
+    ids = np.array([instance_id(prediction, name) for name in names])
+    return prediction.once(
         _areas,
-        lambda: (ids, counts(rollout.observed.masks, ids), usual_sizes(rollout.masks, ids)),
+        lambda: (ids, counts(prediction.observed.masks, ids), usual_sizes(prediction.masks, ids)),
     )
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_metrics.pixel import videos
 
 Sums = NDArray[np.float64]
@@ -39,31 +39,31 @@ class Response(Metric):
     reads = "pixels"
     of_branches = True
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """Score of each frame over all branches, `[T]`; NaN where there is no true response."""
-        errors, energy = response_sums(rollout)
+        errors, energy = response_sums(prediction)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(energy > 0, 1 - errors / energy, np.nan)
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """Score over all frames and branches; NaN without a true response."""
-        errors, energy = response_sums(rollout)
+        errors, energy = response_sums(prediction)
         return 1 - errors.sum() / energy.sum() if energy.sum() > 0 else float("nan")
 
-    def weight(self, rollout: Rollout) -> float:
+    def weight(self, prediction: Prediction) -> float:
         """Energy of the true response: the weighted mean of clips is then their pooled score."""
-        return float(response_sums(rollout)[1].sum())
+        return float(response_sums(prediction)[1].sum())
 
 
-def response_sums(rollout: Rollout) -> tuple[Sums, Sums]:
+def response_sums(prediction: Prediction) -> tuple[Sums, Sums]:
     """Σ|Δ − Δ*|² and Σ|Δ*|² of each frame over all branches.
 
     Raises:
         ShapeError: prediction and target of the clip or a branch differ in shape.
     """
-    predicted, true = videos(rollout)
+    predicted, true = videos(prediction)
     errors, energy = np.zeros(len(true)), np.zeros(len(true))
-    for branch in rollout.branches:
+    for branch in prediction.branches:
         predicted_branch, true_branch = videos(branch)
         response = true_branch - true
         errors += ((predicted_branch - predicted - response) ** 2).sum((1, 2, 3))

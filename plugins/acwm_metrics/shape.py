@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from acwm_core.env.physics import Physics
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import (
     PhysicalMetric,
     instance_id,
@@ -40,12 +40,12 @@ class MaskIoU(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs masks."""
         return None if physics.objects or physics.shapes else "no instances whose masks are read"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """IoU of each frame, `[T]`, in [0, 1]."""
-        physics = physics_of(rollout)
+        physics = physics_of(prediction)
         names = dict.fromkeys((*physics.objects, *physics.shapes))
-        ids = np.array([instance_id(rollout, name) for name in names])
-        seen, true = rollout.observed.masks, rollout.masks
+        ids = np.array([instance_id(prediction, name) for name in names])
+        seen, true = prediction.observed.masks, prediction.masks
         both = counts(np.where(seen == true, seen, 0), ids)
         either = counts(seen, ids) + counts(true, ids) - both
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -67,10 +67,10 @@ class OutlineError(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs instances with a shape instead of a pose."""
         return None if physics.shapes else "nothing that changes its shape"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in pixels."""
-        ids = [instance_id(rollout, name) for name in physics_of(rollout).shapes]
-        pairs = zip(rollout.observed.masks, rollout.masks, strict=True)
+        ids = [instance_id(prediction, name) for name in physics_of(prediction).shapes]
+        pairs = zip(prediction.observed.masks, prediction.masks, strict=True)
         errors = [[_apart(seen == i, true == i) for i in ids] for seen, true in pairs]
         return row_means(np.array(errors))
 
@@ -90,12 +90,12 @@ class HeightError(PhysicalMetric):
         """See `PhysicalMetric.lacking`: it needs surfaces whose height is read."""
         return None if physics.levels else "no surface whose height is read"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The error in each frame, `[T]`, in m."""
-        true, start = truth_of(rollout), start_of(rollout)
+        true, start = truth_of(prediction), start_of(prediction)
         errors = [
-            np.abs(measured(level, rollout) - level.measure(true, start))
-            for level in physics_of(rollout).levels
+            np.abs(measured(level, prediction) - level.measure(true, start))
+            for level in physics_of(prediction).levels
         ]
         return row_means(np.concatenate(errors, axis=1))
 

@@ -21,7 +21,7 @@ from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError
-from acwm_core.evaluation.metric import Metric, Rollout, SetMetric
+from acwm_core.evaluation.metric import Metric, Prediction, SetMetric
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import own_name
 
@@ -91,18 +91,18 @@ class TorchMetric(Metric):
         """The class and the version of torchmetrics."""
         return {"class": self._class, "torchmetrics": version("torchmetrics")}
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """Score of each frame by itself, `[T]`."""
-        predicted, true = self._clips(rollout)
+        predicted, true = self._clips(prediction)
         return np.array([self._score(predicted[t, None], true[t, None]) for t in range(len(true))])
 
-    def value(self, rollout: Rollout) -> float:
+    def value(self, prediction: Prediction) -> float:
         """Score of all frames of the clip together."""
-        return self._score(*self._clips(rollout))
+        return self._score(*self._clips(prediction))
 
-    def _clips(self, rollout: Rollout) -> tuple[Clip, Clip]:
-        rollout.check_shapes()
-        return rollout.prediction.detach().cpu().float(), rollout.target.detach().cpu().float()
+    def _clips(self, prediction: Prediction) -> tuple[Clip, Clip]:
+        prediction.check_shapes()
+        return prediction.video.detach().cpu().float(), prediction.target.detach().cpu().float()
 
     def _score(self, prediction: Clip, target: Clip) -> float:
         with self._lock, torch.no_grad():
@@ -206,9 +206,9 @@ class RolloutMetric(torchmetrics.Metric):
             raise PluginError(f"{self.metric.name} cannot be measured: {reason}")
         for predicted, true, episode in zip(*pairs, known, strict=True):
             if episode is None:
-                self._add(_rollout_of_pixels(predicted, true, card))
+                self._add(_of_pixels(predicted, true, card))
             else:
-                self._add(Rollout.of(episode, true, predicted, card, self.estimator))
+                self._add(Prediction.of(episode, predicted, true, card, self.estimator))
 
     def compute(self) -> Tensor:
         """The score of all clips together, a scalar; NaN if no clip has a score."""
@@ -224,12 +224,12 @@ class RolloutMetric(torchmetrics.Metric):
             value = self.metric.summed_up(scores, weights)
         return torch.tensor(value, device=self.device)
 
-    def _add(self, rollout: Rollout) -> None:
-        with torch.autocast(rollout.target.device.type, enabled=False):
+    def _add(self, prediction: Prediction) -> None:
+        with torch.autocast(prediction.target.device.type, enabled=False):
             if isinstance(self.metric, SetMetric):
-                score, weight = self.metric.features(rollout), 1.0
+                score, weight = self.metric.features(prediction), 1.0
             else:
-                score, weight = self.metric.scored(rollout)
+                score, weight = self.metric.scored(prediction)
                 if np.isnan(score):
                     return
         # Apple's GPUs do not support double precision.
@@ -258,11 +258,11 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def _rollout_of_pixels(prediction: Clip, target: Clip, card: EnvironmentCard) -> Rollout:
-    """A rollout of which only the pixels are known."""
+def _of_pixels(prediction: Clip, target: Clip, card: EnvironmentCard) -> Prediction:
+    """A prediction of which only the pixels are known."""
     frames, _, height, width = target.shape
     actions, masks = np.zeros((frames, 1), np.float32), np.zeros((frames, height, width), np.uint8)
-    return Rollout(prediction, target, actions, {}, masks, np.zeros((0, 3), np.int32), card)
+    return Prediction(prediction, target, actions, {}, masks, np.zeros((0, 3), np.int32), card)
 
 
 def _card(video: Video) -> EnvironmentCard:

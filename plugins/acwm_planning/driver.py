@@ -11,7 +11,7 @@ from torch import Tensor
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Frame, Goal, Task
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.shapes import Actions
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.controllers import PlanningController, Rollouts

@@ -14,7 +14,7 @@ from acwm_core.env.environment import Environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
 from acwm_core.training.trained import find_run

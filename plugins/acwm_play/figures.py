@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import sentence
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.plugins import catalog
 from acwm_play.simulator import TimeStep
 
@@ -76,14 +76,14 @@ class Instruments:
 
     def read(self, seen: NDArray[np.uint8], truth: TimeStep, floor: bool = False) -> Figures:
         """Compare a frame `[H, W, 3]` from the model with the simulator's truth."""
-        predicted = self._rollout(seen, truth)
-        floors = self._scores(self._rollout(truth.frame, truth)) if floor else {}
+        predicted = self._predicted(seen, truth)
+        floors = self._scores(self._predicted(truth.frame, truth)) if floor else {}
         return Figures(self._scores(predicted), floors, self._missing(predicted))
 
-    def _rollout(self, frame: NDArray[np.uint8], truth: TimeStep) -> Rollout:
+    def _predicted(self, frame: NDArray[np.uint8], truth: TimeStep) -> Prediction:
         pictures = torch.from_numpy(np.stack([frame, truth.frame])).permute(0, 3, 1, 2) / 255
-        return Rollout(
-            prediction=pictures[:1],
+        return Prediction(
+            video=pictures[:1],
             target=pictures[1:],
             actions=np.zeros((1, self._card.action.size), np.float32),
             states={name: value[None] for name, value in truth.state.items()},
@@ -93,18 +93,18 @@ class Instruments:
             estimator=self._estimator,
         )
 
-    def _scores(self, rollout: Rollout) -> dict[str, float | None]:
-        values = {name: metric.scored(rollout)[0] for name, metric in self._metrics.items()}
+    def _scores(self, prediction: Prediction) -> dict[str, float | None]:
+        values = {name: metric.scored(prediction)[0] for name, metric in self._metrics.items()}
         return {name: v if math.isfinite(v) else None for name, v in values.items()}
 
-    def _missing(self, rollout: Rollout) -> list[str]:
+    def _missing(self, prediction: Prediction) -> list[str]:
         if self._estimator is None:
             return []
         missing: list[str] = []
         for name in self._estimator.physics.objects:
             number = self._card.instances.index(name)
-            shown = int((rollout.masks == number).sum())
-            found = int((rollout.observed.masks == number).sum())
+            shown = int((prediction.masks == number).sum())
+            found = int((prediction.observed.masks == number).sum())
             if shown >= MIN_PIXELS and found < SEEN * shown:
                 missing.append(name)
         return missing

@@ -13,12 +13,12 @@ import numpy as np
 
 from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
-from acwm_core.evaluation.clip_results import ClipResult, read_results
-from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.results import Score, Summary
 from acwm_core.evaluation.statistics import holm, paired_bootstrap
+from acwm_core.evaluation.storage import read_scores
 from acwm_report.uses import Use, uses_of
 
-Rows = dict[tuple[str, int, int, int], ClipResult]
+Rows = dict[tuple[str, int, int, int], Score]
 """The model's results by what identifies a clip: split, episode, first frame and length."""
 
 
@@ -231,13 +231,13 @@ def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) 
 
 
 def _model_rows(run: Path) -> Rows:
-    found = (each for each in read_results(run) if each.kind == "model")
+    found = (each for each in read_scores(run) if each.kind == "model")
     return {(each.split, each.episode, each.start, each.frames): each for each in found}
 
 
 def _common_clips(
     split: str, runs: Mapping[str, Rows], warnings: list[str]
-) -> dict[str, list[ClipResult]]:
+) -> dict[str, list[Score]]:
     each = [{clip for clip in rows if clip[0] == split} for rows in runs.values()]
     common = sorted(set[Any].intersection(*each))
     if not common:
@@ -251,7 +251,7 @@ def _common_clips(
 
 
 def _difference(
-    split: str, metric: str, pair: Mapping[str, Sequence[ClipResult]], higher_is_better: bool
+    split: str, metric: str, pair: Mapping[str, Sequence[Score]], higher_is_better: bool
 ) -> list[Difference]:
     """Compare two runs; empty if no clip has the metric for both. `winner` is not yet tested."""
     (first, ours), (second, theirs) = pair.items()

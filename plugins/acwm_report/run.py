@@ -11,8 +11,8 @@ from typing import TypeVar
 from jinja2 import TemplateError
 
 from acwm_core.errors import AcwmError, AcwmWarning, DataError
-from acwm_core.evaluation.clip_results import ClipResult, read_results
-from acwm_core.evaluation.results import Estimate, MetricInfo, Scores, Summary
+from acwm_core.evaluation.results import Estimate, MetricInfo, Score, SetSummary, Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_experiment.table import SUMMARY, Experiment
 from acwm_report.score_grid import Scale, described
 
@@ -71,7 +71,7 @@ class EvaluatedRun:
 
     folder: Path  # the run folder
     summary: Summary  # its scores; every metric has a title
-    results: Sequence[ClipResult]  # the results of all rows and clips
+    results: Sequence[Score]  # the results of all rows and clips
     key: str  # prefix that makes its ids unique on a page
 
     @classmethod
@@ -83,7 +83,7 @@ class EvaluatedRun:
         """
         summary = Summary.read(folder)
         summary = replace(summary, metrics=described(summary.metrics))
-        return cls(folder, summary, read_results(folder), key)
+        return cls(folder, summary, read_scores(folder), key)
 
     @property
     def headline(self) -> MetricInfo:
@@ -101,7 +101,7 @@ class EvaluatedRun:
         scale = self.scale(self.summary.headline)
         return replace(scale, decimals=max(1, scale.decimals - 1))
 
-    def gains(self, scores: Scores) -> dict[str, Estimate]:
+    def gains(self, scores: SetSummary) -> dict[str, Estimate]:
         """The model's advantage over each baseline in the headline metric; positive is better."""
         sign = 1 if self.headline.higher_is_better else -1
         found: dict[str, Estimate] = {}
@@ -188,7 +188,7 @@ def branch_title(name: str) -> str:
     return BRANCHES.get(name, f"{name.replace('_', ' ')} shifted")
 
 
-def clips_title(scores: Scores) -> str:
+def clips_title(scores: SetSummary) -> str:
     """The number of clips in words: ``12 episodes``, or ``120 clips of 12 episodes``."""
     if scores.episodes in (0, scores.clips):
         return f"{scores.clips} episodes"

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import published_tables
-from acwm_core.evaluation.clip_results import read_results, tabulate
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.statistics import ClipScores
+from acwm_core.evaluation.storage import read_scores
+from acwm_core.evaluation.summarise import tabulate
 from acwm_experiment.table import SUMMARY, Experiment
 from acwm_report.run import EvaluatedRun, clips_title
 from acwm_report.score_grid import (
@@ -111,7 +112,7 @@ class _ExperimentTables:
         names = dict.fromkeys([*pixels[:1], first.headline])
         if quoted:
             names = next(iter(quoted[0].scores.values()))
-        from acwm_core.evaluation.scoring import build_metrics  # needs torch
+        from acwm_core.evaluation.score import build_metrics  # needs torch
 
         settings = first.provenance.get("evaluation", {})
         listed = settings.get("metrics", infos), settings.get("metric_options")
@@ -175,7 +176,7 @@ class _ExperimentTables:
     def _read(self, runs: Sequence[Path]) -> dict[tuple[str, str], list[ClipScores]]:
         found: dict[tuple[str, str], list[ClipScores]] = {}
         for run in runs:
-            results = [each for each in read_results(run) if each.kind == "model"]
+            results = [each for each in read_scores(run) if each.kind == "model"]
             for split in dict.fromkeys(each.split for each in results):
                 there = [each for each in results if each.split == split]
                 metrics = {n: m for n, m in self._metrics.items() if n in there[0].values}

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acwm_core.evaluation.statistics.bootstrap import (
+from acwm_core.evaluation.statistics import (
     FLAT,
     MIN_EPISODES,
     RESAMPLES,
+    ClipScores,
     Estimate,
     Values,
     around,
@@ -22,7 +23,6 @@ from acwm_core.evaluation.statistics.bootstrap import (
     standard_error,
     studentised,
 )
-from acwm_core.evaluation.statistics.scores import ClipScores
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import ClipResult
 from acwm_core.evaluation.metric import MetricInfo
-from acwm_core.evaluation.results import Estimate, Scores, SplitSummary, VideoRecord, defined
+from acwm_core.evaluation.results import (
+    Estimate,
+    Score,
+    SetSummary,
+    SplitSummary,
+    VideoRecord,
+    defined,
+)
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
 from acwm_report.run import (
@@ -112,7 +118,7 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
 
 def label_tables(run: EvaluatedRun) -> list[Table]:
     """The headline metric grouped by what was shifted; no table if nothing was shifted."""
-    groups: list[tuple[str, Scores, bool]] = []
+    groups: list[tuple[str, SetSummary, bool]] = []
     for split, result in run.summary.splits.items():
         groups.append((split_title(split), result.scores, True))
         groups += [(f"shifted: {label_title(x)}", s, False) for x, s in result.labels.items()]
@@ -155,7 +161,7 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     splits = list(summary.splits)
     sign = 1 if run.headline.higher_is_better else -1
 
-    def place(result: ClipResult) -> tuple[int, float]:
+    def place(result: Score) -> tuple[int, float]:
         value = result.values[headline]
         return splits.index(result.split), float("inf") if math.isnan(value) else sign * value
 
@@ -174,7 +180,7 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     return Table("", columns, rows, "Episode", name="episodes")
 
 
-def _clip(result: ClipResult | VideoRecord) -> tuple[str, int, int]:
+def _clip(result: Score | VideoRecord) -> tuple[str, int, int]:
     return result.split, result.episode, result.start
 
 

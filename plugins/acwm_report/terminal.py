@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from acwm_core.evaluation.benchmark import PublishedRow
-    from acwm_core.evaluation.results import Counterfactual, Estimate, Scores, Summary
+    from acwm_core.evaluation.results import Counterfactual, Estimate, SetSummary, Summary
     from acwm_severity.curves import SeverityCurve
 
 ROWS = {
@@ -53,7 +53,7 @@ def print_summary(summary: Summary) -> None:
         click.echo(about_published(summary))
 
 
-def _print_remarks(scores: Scores) -> None:
+def _print_remarks(scores: SetSummary) -> None:
     """Print which predictions failed, and which scores are left out of the means above."""
     for row in scores.failed:
         failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"

@@ -10,8 +10,8 @@ from typing import Any
 from markupsafe import Markup
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.replacing import result_file
 from acwm_core.evaluation.results import FOLDER, VIDEOS, VideoRecord
+from acwm_core.evaluation.storage import result_file
 from acwm_report.run import EvaluatedRun
 
 MEGABYTES = 16

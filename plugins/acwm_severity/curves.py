@@ -13,8 +13,7 @@ from pydantic import Field
 
 from acwm_core.env.episode import REGIONS, Factor, FactorValue
 from acwm_core.errors import DataError, RecipeError, suggest
-from acwm_core.evaluation.facts import Name, Provenance
-from acwm_core.evaluation.results import FOLDER, MetricInfo, Scores
+from acwm_core.evaluation.results import FOLDER, MetricInfo, SetSummary
 from acwm_core.recipe.text import parse
 from acwm_core.untrusted import read_json
 
@@ -46,7 +45,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SeverityPoint:
-    """Scores at one value of the factor.
+    """SetSummary at one value of the factor.
 
     Attributes:
         value: value of the factor in all episodes.
@@ -59,7 +58,7 @@ class SeverityPoint:
     value: FactorValue
     severity: float
     in_train: bool
-    scores: Scores
+    scores: SetSummary
     checksum: str
 
 
@@ -83,18 +82,18 @@ class SeverityCurve:
         provenance: as in ``summary.json``.
     """
 
-    factor: Name
+    factor: str
     description: str
     unit: str
     kind: str
     train: list[Any]
     ood: list[Any]
     episodes: int
-    metrics: dict[Name, MetricInfo]
-    headline: Name
+    metrics: dict[str, MetricInfo]
+    headline: str
     points: Annotated[list[SeverityPoint], Field(min_length=1)]
     left_out: list[float]
-    provenance: Provenance
+    provenance: dict[str, Any]
 
     @property
     def text(self) -> str:

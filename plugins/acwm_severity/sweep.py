@@ -12,13 +12,13 @@ from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import EpisodeSpec, Factor, FactorValue, Split
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError
-from acwm_core.evaluation.clip_results import summarise
 from acwm_core.evaluation.clips import Predictor, plan_clips
-from acwm_core.evaluation.config import refuse_other_result
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
+from acwm_core.evaluation.interventions import simulator_of
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import Scores, write_json
-from acwm_core.evaluation.simulator import simulator_of
+from acwm_core.evaluation.results import SetSummary, write_json
+from acwm_core.evaluation.storage import refuse_other_result
+from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run import RunFolder
 from acwm_core.training.trained import run_to_write
 from acwm_severity.curves import (
@@ -114,7 +114,7 @@ def sweep_severity(
 
 
 def _point(
-    factor: Factor, value: FactorValue, scores: Scores, episodes: EpisodeDataset
+    factor: Factor, value: FactorValue, scores: SetSummary, episodes: EpisodeDataset
 ) -> SeverityPoint:
     level = factor.severity(value)
     return SeverityPoint(value, level, level == 0, scores, episodes.checksum)

@@ -19,8 +19,8 @@ class Distance(Metric):
 
     name = "distance"
 
-    def per_frame(self, rollout):
-        error = (rollout.prediction - rollout.target).abs()
+    def per_frame(self, prediction):
+        error = (prediction.video - prediction.target).abs()
         return error.mean((1, 2, 3)).double().numpy()
 
 
@@ -41,8 +41,8 @@ def test_a_sound_metric_passes():
 
 @FLAWS.caught_by("scores a clip", "scores")
 class ForgetsTheFirst(Distance):
-    def per_frame(self, rollout):
-        return super().per_frame(rollout)[1:]
+    def per_frame(self, prediction):
+        return super().per_frame(prediction)[1:]
 
 
 @FLAWS.caught_by("scores a clip", "outside its bounds -1 to 0")
@@ -52,10 +52,10 @@ class LeavesItsBounds(Distance):
 
 @FLAWS.caught_by("scores a clip", "no frame of a noisy prediction")
 class NeverDefined(Distance):
-    def per_frame(self, rollout):
-        return np.full(len(rollout.target), np.nan)
+    def per_frame(self, prediction):
+        return np.full(len(prediction.target), np.nan)
 
-    def value(self, rollout):
+    def value(self, prediction):
         return 1.0
 
 
@@ -76,22 +76,22 @@ class WrongDirection(Distance):
 
 @FLAWS.caught_by("more noise is no better", "with growing noise")
 class Saturates(Distance):
-    def value(self, rollout):
-        error = super().value(rollout)
+    def value(self, prediction):
+        error = super().value(prediction)
         return error if error < 0.1 else 0.1 + 0.01 / error
 
 
 @FLAWS.caught_by("scoring repeats and leaves no trace", "changes the video")
 class InPlace(Distance):
-    def per_frame(self, rollout):
-        rollout.prediction.mul_(0.999)
-        return np.ones(len(rollout.target))
+    def per_frame(self, prediction):
+        prediction.video.mul_(0.999)
+        return np.ones(len(prediction.target))
 
 
 @FLAWS.caught_by("scoring repeats and leaves no trace", "second scoring")
 class Random(Distance):
-    def per_frame(self, rollout):
-        return super().per_frame(rollout) + np.random.default_rng().random()
+    def per_frame(self, prediction):
+        return super().per_frame(prediction) + np.random.default_rng().random()
 
 
 @FLAWS.caught_by("summary of equals is their value", "three times")
@@ -105,8 +105,8 @@ class Change(SetMetric):
 
     name = "change"
 
-    def features(self, rollout):
-        clips = (rollout.prediction, rollout.target)
+    def features(self, prediction):
+        clips = (prediction.video, prediction.target)
         return np.stack([c.diff(dim=0).abs().mean((0, 1)).flatten().numpy() for c in clips])
 
     def distance(self, features):
@@ -120,8 +120,8 @@ def test_a_sound_metric_of_sets_passes():
 
 @SET_FLAWS.caught_by("scores a set", "not (2, D)")
 class OneVector(Change):
-    def features(self, rollout):
-        return super().features(rollout)[0]
+    def features(self, prediction):
+        return super().features(prediction)[0]
 
 
 @SET_FLAWS.caught_by("says what it is", "empty")
@@ -144,5 +144,5 @@ class Inverse(Change):
 
 @SET_FLAWS.caught_by("scoring repeats and leaves no trace", "second scoring")
 class RandomSet(Change):
-    def features(self, rollout):
-        return super().features(rollout) + 1e-9 * np.random.default_rng().random()
+    def features(self, prediction):
+        return super().features(prediction) + 1e-9 * np.random.default_rng().random()

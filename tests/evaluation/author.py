@@ -62,8 +62,8 @@ class FixedSizeWorld(World):
 class RaisingMetric(Metric):
     name = "raising"
 
-    def per_frame(self, rollout):
-        return rollout.states["nothing"]  # line of RaisingMetric
+    def per_frame(self, prediction):
+        return prediction.states["nothing"]  # line of RaisingMetric
 
 
 class UnfinishedMetric(Metric):
@@ -78,8 +78,8 @@ class DriftMetric(Metric):
     def unavailable(self, card, estimator):
         return None if card.name == "drift" else "it is about drifting squares"
 
-    def per_frame(self, rollout):
-        return (rollout.prediction - rollout.target).abs().mean((1, 2, 3)).double().numpy()
+    def per_frame(self, prediction):
+        return (prediction.video - prediction.target).abs().mean((1, 2, 3)).double().numpy()
 
 
 class RaisingModel(LinearModel):

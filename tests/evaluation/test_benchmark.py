@@ -8,16 +8,11 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
-from acwm_core.evaluation.benchmark import (
-    Protocol,
-    PublishedRow,
-    PublishedTable,
-    published_for,
-)
-from acwm_core.evaluation.clip_results import read_results
+from acwm_core.evaluation.benchmark import PublishedRow, PublishedTable, published_for
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.protocol import Protocol, protocol_named
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import Catalog, hookimpl
 from tests.evaluation import tiny
 
@@ -63,7 +58,7 @@ def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_pa
     run = tiny.make_run(tmp_path / "run", data, frames=None, videos=0, metrics=["psnr", "mse"])
     outcome = CliRunner().invoke(main, ["evaluate", str(run), "--protocol", "ends"])
     assert outcome.exit_code == 0, outcome.output
-    assert {(r.episode, r.start, r.frames) for r in read_results(run)} == {
+    assert {(r.episode, r.start, r.frames) for r in read_scores(run)} == {
         (episode, 8, 5) for episode in (0, 2, 4)
     }
     summary = Summary.read(run)

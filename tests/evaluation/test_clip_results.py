@@ -3,16 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from acwm_core.evaluation.clip_results import (
-    ClipResult,
-    gap,
-    horizon,
-    read_results,
-    summarise,
-    write_results,
-)
 from acwm_core.evaluation.metric import Metric
-from acwm_core.evaluation.results import Estimate
+from acwm_core.evaluation.results import Estimate, Score
+from acwm_core.evaluation.storage import read_scores, write_scores
+from acwm_core.evaluation.summarise import gap, horizon, summarise
 from acwm_metrics.pixel import PSNR
 
 
@@ -33,7 +27,7 @@ METRICS = {"error": Error(), "quality": Quality()}
 
 def clip(episode, kind, error, *, weight=1.0, curve=None, label=None, start=0):
     curve = curve or [error, error]
-    return ClipResult(
+    return Score(
         "ood_test",
         episode,
         start,
@@ -79,7 +73,7 @@ def test_psnr_is_summed_up_by_the_metric_itself():
     errors = [1e-2, 1e-4]
     metric = PSNR()
     results = [
-        ClipResult("ind_test", e, 0, None, kind, 1, {"psnr": v}, {"psnr": 1.0}, {"psnr": [v]})
+        Score("ind_test", e, 0, None, kind, 1, {"psnr": v}, {"psnr": 1.0}, {"psnr": [v]})
         for e, v in enumerate(-10 * np.log10(np.array(errors) + 1e-8))
         for kind in ("model", "shuffled", "copy")
     ]
@@ -108,5 +102,5 @@ def test_results_survive_parquet(tmp_path):
     results = [clip(0, "model", 0.25, label="colour"), clip(1, "copy", 0.5, weight=2.0)]
     folder = tmp_path / "evaluation"
     folder.mkdir()
-    write_results(folder / "episodes.parquet", results)
-    assert read_results(tmp_path) == results
+    write_scores(folder / "episodes.parquet", results)
+    assert read_scores(tmp_path) == results

@@ -5,16 +5,16 @@ import torch
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import (
-    Batch,
-    ClipPlan,
-    batches,
+    Clip,
     derangement,
-    load_samples,
+    donor_actions,
     noise_seed,
     plan_clips,
+    read_clips,
 )
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.predict import Evaluator
 from tests.core.tiny import tiny_world_model
 
 
@@ -52,17 +52,16 @@ def test_one_episode_has_no_other():
         plan_clips("ind_test", [9], EvaluationConfig())
 
 
-def test_a_sample_is_read_from_the_first_frame(data):
+def test_a_clip_is_read_from_the_first_frame(data):
     episodes = EpisodeDataset(data, "ind_test")
-    plan = plan_clips("ind_test", episodes.lengths, EvaluationConfig(frames=9))[2]
-    (sample,), episode, donor = load_samples([plan], episodes), episodes[2], episodes[plan.donor]
-    np.testing.assert_array_equal(
-        (sample.video.numpy() * 255).round(), episode.video[:9].transpose(0, 3, 1, 2)
-    )
-    np.testing.assert_array_equal(sample.episode.actions[:8], episode.actions[:8])
-    np.testing.assert_array_equal(sample.donor_actions[:8], donor.actions[:8])
-    assert not sample.episode.actions[8].any()
-    assert not sample.donor_actions[8].any()
+    clip = plan_clips("ind_test", episodes.lengths, EvaluationConfig(frames=9))[2]
+    ((_, part),), whole, donor = read_clips([clip], episodes), episodes[2], episodes[clip.donor]
+    donated = donor_actions(clip, part.actions, episodes)
+    np.testing.assert_array_equal(part.video, whole.video[:9])
+    np.testing.assert_array_equal(part.actions[:8], whole.actions[:8])
+    np.testing.assert_array_equal(donated[:8], donor.actions[:8])
+    assert not part.actions[8].any()
+    assert not donated[8].any()
 
 
 @pytest.mark.parametrize("frames", [None, 1000])
@@ -78,9 +77,10 @@ def test_the_full_protocol_takes_whole_episodes(frames):
 def test_batches_hold_clips_of_one_length(data):
     episodes = EpisodeDataset(data, "ind_test")
     lengths = [9, 9, 9, 5, 9]
-    plans = [ClipPlan("ind_test", e, 0, n, 0, 0, 0) for e, n in enumerate(lengths)]
-    samples = load_samples(plans, episodes)
-    grouped = [[len(sample.video) for sample in group] for group in batches(samples, 2)]
+    clips = [Clip("ind_test", e, 0, n) for e, n in enumerate(lengths)]
+    evaluator = Evaluator(tiny_world_model(), None, {}, EvaluationConfig(batch_size=2))
+    made = evaluator.predictions(clips, episodes, ["copy"])
+    grouped = [[len(each.video) for each in batch] for batch in made]
     assert grouped == [[9, 9], [9], [5], [9]]
 
 
@@ -91,8 +91,14 @@ def test_rows_predict_what_they_are_named_after():
     own, other = torch.rand(2, 2, 9, 2, generator=generator)
     world_model.clip_frames = 5
     evaluator = Evaluator(world_model, None, {}, EvaluationConfig(steps=2))
-    batch = Batch(video, own, other, seeds=[3, 4])
-    rows = evaluator.predict(batch, ["model", "shuffled", "copy", "codec"])
+    truths = [
+        Prediction(clip, clip, actions.numpy(), {}, None, None, None, clip=Clip(seed=seed))
+        for clip, actions, seed in zip(video, own, (3, 4), strict=True)
+    ]
+    kinds = ["model", "shuffled", "copy", "codec"]
+    made = evaluator.predict(truths, kinds, other.numpy())
+    assert [each.kind for each in made] == 2 * kinds
+    rows = {kind: torch.stack([p.video for p in made if p.kind == kind]) for kind in kinds}
 
     def rollout(actions):
         return world_model.rollout(video[:, 0], actions, steps=2, window=5, seeds=[3, 4])

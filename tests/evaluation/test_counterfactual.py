@@ -9,20 +9,20 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.environment import ActionSpec
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.clips import ClipPlan, as_clip
+from acwm_core.evaluation.clips import Clip, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import counterfactual
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.metric import Rollout
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import (
+from acwm_core.evaluation.interventions import (
     SIZES,
-    asked_plans,
+    asked_clips,
     max_branches,
     plan_branches,
-    simulate_fans,
+    simulate_branches,
 )
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.responses import counterfactual
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.score import build_metrics
 from acwm_metrics.response import Response
 
 FRAMES, CLIPS = 10, 2
@@ -71,7 +71,7 @@ def world():
     environment = Disc(size=(32, 48))
     specs = [EpisodeSpec("disc", "ind_test", index) for index in range(CLIPS)]
     episodes = Episodes(simulate(environment, spec) for spec in specs)
-    plans = [ClipPlan("ind_test", i, 0, 24, donor=1 - i, donor_start=0, seed=i) for i in range(2)]
+    plans = [Clip("ind_test", i, 0, 24, donor=1 - i, donor_start=0, seed=i) for i in range(2)]
     return environment, specs, episodes, plans
 
 
@@ -80,7 +80,7 @@ def ask(world, predict):
     model = Known(environment, specs, predict)
     config = EvaluationConfig(batch_size=3, device="cpu")
     evaluator = Evaluator(model, environment.card, {}, config)
-    fans = simulate_fans(environment, plans, episodes, FRAMES)
+    fans = simulate_branches(environment, plans, episodes, FRAMES)
     return counterfactual(evaluator, {"response": Response()}, fans)
 
 
@@ -222,9 +222,9 @@ def test_a_branch_that_changes_nothing_is_not_asked_for():
 
 def test_only_clips_that_begin_with_their_episode_are_asked_about():
     starts = [(0, 0), (0, 12), (1, 0), (2, 0)]
-    plans = [ClipPlan("ind_test", e, s, 9, donor=3, donor_start=0, seed=1) for e, s in starts]
+    plans = [Clip("ind_test", e, s, 9, donor=3, donor_start=0, seed=1) for e, s in starts]
     evaluator = Evaluator(None, Disc.card, {}, EvaluationConfig(counterfactual_episodes=2))
-    found = asked_plans(evaluator, {"ind_test": plans})["counterfactual"]
+    found = asked_clips(evaluator, {"ind_test": plans})["counterfactual"]
     assert [plan.episode for plan in found["ind_test"]] == [0, 1]
 
 
@@ -232,12 +232,12 @@ def test_push_cubes_pusher_stays_where_it_is_on_the_branch_still():
     environment = make_environment("push_cube", {"size": 64})
     episode = simulate(environment, EpisodeSpec("push_cube", "ind_test", 1), frames=8)
     episodes = Episodes([episode, episode])
-    plan = ClipPlan("ind_test", 0, 0, 8, donor=1, donor_start=0, seed=0)
-    (fan,) = simulate_fans(environment, [plan], episodes, 8)
-    made = dict(zip([branch.kind for branch in fan.branches], fan.episodes, strict=True))
+    plan = Clip("ind_test", 0, 0, 8, donor=1, donor_start=0, seed=0)
+    ((branches, factual),) = simulate_branches(environment, [plan], episodes, 8)
+    made = dict(zip([branch.kind for branch in branches], factual.branches, strict=True))
     places = made["still"].states["pusher_position"]
     assert np.abs(places - places[0]).max() < 1e-4
-    assert np.array_equal(fan.factual.video, episode.video)
+    assert torch.equal(factual.video, as_clip(episode.video))
 
 
 def test_an_evaluation_asks_and_says_what_it_could_not(evaluated):
@@ -261,6 +261,6 @@ def test_metrics_of_branches_have_a_list_of_their_own():
 
 def test_without_branches_there_is_no_response():
     clip, nothing = torch.zeros(3, 3, 8, 8), np.zeros((3, 8, 8), np.uint8)
-    rollout = Rollout(clip, clip, np.zeros((3, 2)), {}, nothing, np.zeros((0, 3)), Disc.card)
-    assert np.isnan(Response().value(rollout))
-    assert Response().weight(rollout) == 0
+    prediction = Prediction(clip, clip, np.zeros((3, 2)), {}, nothing, np.zeros((0, 3)), Disc.card)
+    assert np.isnan(Response().value(prediction))
+    assert Response().weight(prediction) == 0

@@ -10,14 +10,14 @@ from skimage.metrics import structural_similarity
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
-from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.clips import derangement, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import choose_device, evaluate_run
-from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.interventions import Interventions
+from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import Simulated
+from acwm_core.evaluation.score import build_metrics
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from tests.evaluation import tiny
 
@@ -55,7 +55,7 @@ def by_hand(run, data, split):
 
 @pytest.mark.parametrize("split", ["ind_test", "ood_test"])
 def test_numbers_are_those_of_an_independent_computation(evaluated, data, split):
-    results = [r for r in read_results(evaluated) if r.split == split]
+    results = [r for r in read_scores(evaluated) if r.split == split]
     expected = by_hand(evaluated, data, split)
     assert {(r.episode, r.kind) for r in results} == set(expected)
     for result in results:
@@ -72,7 +72,7 @@ def test_numbers_are_those_of_an_independent_computation(evaluated, data, split)
 
 
 def test_the_copy_row_is_the_error_of_standing_still(evaluated, data):
-    for result in read_results(evaluated):
+    for result in read_scores(evaluated):
         if result.kind == "copy":
             video = EpisodeDataset(data, result.split)[result.episode].video[:9] / 255.0
             curve = ((video - video[0]) ** 2).mean((1, 2, 3))
@@ -112,11 +112,11 @@ def test_the_gap_is_that_of_the_two_splits(evaluated):
 
 
 def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
-    first = read_results(evaluated)
+    first = read_scores(evaluated)
     for size in (1, 3):
         run = tiny.make_run(tmp_path / str(size), data, batch_size=size)
         evaluate_run(run, progress=False)
-        for a, b in zip(first, read_results(run), strict=True):
+        for a, b in zip(first, read_scores(run), strict=True):
             assert (a.split, a.episode, a.kind) == (b.split, b.episode, b.kind)
             np.testing.assert_allclose(a.curves["mse"], b.curves["mse"], rtol=1e-5, atol=1e-10)
 
@@ -124,7 +124,7 @@ def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
 def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
     run = tiny.make_run(tmp_path / "again", data, **tiny.SWEEP)
     evaluate_run(run, progress=False)
-    assert read_results(run) == read_results(evaluated)
+    assert read_scores(run) == read_scores(evaluated)
     before, after = Summary.read(evaluated), Summary.read(run)
     assert after.splits == before.splits
     assert after.gap == before.gap
@@ -136,7 +136,7 @@ def test_noise_depends_on_the_seed(evaluated, data, tmp_path):
     run = tiny.make_run(tmp_path / "seed", data)
     evaluate_run(run, overrides=["evaluation.seed=1"], progress=False)
     models = [
-        [r.values["mse"] for r in read_results(each) if r.kind == "model"]
+        [r.values["mse"] for r in read_scores(each) if r.kind == "model"]
         for each in (run, evaluated)
     ]
     assert models[0] != models[1]
@@ -177,8 +177,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
         evaluator,
         results,
         {"ind_test": {}},
-        videos,
-        Simulated(),
+        Interventions(),
     )
     summary.provenance["dataset"] = {"frame_size": [32, 32]}
     _write(run / "evaluation", summary, results, videos)
@@ -215,7 +214,7 @@ def test_the_summary_says_where_it_comes_from(evaluated, data):
 
 
 def test_picks_are_ranked_by_the_headline(evaluated):
-    results = [r for r in read_results(evaluated) if r.kind == "model" and r.split == "ind_test"]
+    results = [r for r in read_scores(evaluated) if r.kind == "model" and r.split == "ind_test"]
     ranked = [r.episode for r in sorted(results, key=lambda r: -r.values["psnr"])]
     picked = {
         v.pick: v.episode
@@ -228,7 +227,7 @@ def test_picks_are_ranked_by_the_headline(evaluated):
 def test_whole_episodes_are_predicted_window_by_window(data, tmp_path):
     run = tiny.make_run(tmp_path / "whole", data, frames=None, videos=0)
     summary = evaluate_run(run, progress=False)
-    assert {r.frames for r in read_results(run)} == {13}
+    assert {r.frames for r in read_scores(run)} == {13}
     assert summary.videos == []
 
 

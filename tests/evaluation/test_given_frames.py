@@ -9,14 +9,14 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import read_results
-from acwm_core.evaluation.clips import ClipPlan, derangement, noise_seed, plan_clips
+from acwm_core.evaluation.clips import Clip, as_clip, derangement, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import counterfactual
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import perturbed_rows, simulate_fans
+from acwm_core.evaluation.interventions import perturbed, simulate_branches
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.responses import counterfactual
+from acwm_core.evaluation.score import build_metrics
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from acwm_metrics.response import Response
 from tests.evaluation import tiny
@@ -67,7 +67,7 @@ def test_scores_begin_with_the_last_given_frame(run, data):
     rows = [torch.tensor(episode.actions[:9]).clone() for episode in episodes]
     for actions in rows:
         actions[-1] = 0
-    found = {(r.episode, r.kind): r for r in read_results(run) if r.split == "ind_test"}
+    found = {(r.episode, r.kind): r for r in read_scores(run) if r.split == "ind_test"}
     assert {result.frames for result in found.values()} == {9 - GIVEN + 1}
     for index in range(len(episodes)):
         expected = by_hand(world_model, episodes, rows, index)
@@ -100,27 +100,27 @@ def world():
     environment = Disc(size=(32, 48))
     specs = [EpisodeSpec("disc", "ind_test", index) for index in range(2)]
     episodes = Episodes(simulate(environment, spec) for spec in specs)
-    plans = [ClipPlan("ind_test", i, 0, 24, 1 - i, 0, seed=i, given=GIVEN) for i in range(2)]
+    plans = [Clip("ind_test", i, 0, 24, 1 - i, 0, seed=i, given=GIVEN) for i in range(2)]
     return environment, specs, episodes, plans
 
 
 def test_branches_begin_with_what_was_given(world):
     environment, specs, episodes, plans = world
-    for fan in simulate_fans(environment, plans, episodes, 10):
-        factual = fan.factual
-        assert np.array_equal(factual.video, episodes[fan.plan.episode].video[:10])
-        for branch, made in zip(fan.branches, fan.episodes, strict=True):
+    for branches, factual in simulate_branches(environment, plans, episodes, 10):
+        assert torch.equal(factual.video, as_clip(episodes[factual.clip.episode].video[:10]))
+        for branch, made in zip(branches, factual.branches, strict=True):
+            assert np.array_equal(branch.actions, made.actions)
             assert np.array_equal(branch.actions[: GIVEN - 1], factual.actions[: GIVEN - 1])
             assert not np.array_equal(branch.actions, factual.actions)
-            assert np.array_equal(made.video[:GIVEN], factual.video[:GIVEN])
-        assert any(not np.array_equal(made.video, factual.video) for made in fan.episodes)
+            assert torch.equal(made.video[:GIVEN], factual.video[:GIVEN])
+        assert any(not torch.equal(made.video, factual.video) for made in factual.branches)
     evaluator = Evaluator(
         Known(environment, specs, simulator),
         environment.card,
         {},
         EvaluationConfig(batch_size=3, device="cpu"),
     )
-    fans = simulate_fans(environment, plans, episodes, 10)
+    fans = simulate_branches(environment, plans, episodes, 10)
     found, _ = counterfactual(evaluator, {"response": Response()}, fans)
     assert response(found) == pytest.approx(1, abs=1e-9)
     assert found.frames == 10 - GIVEN + 1
@@ -130,7 +130,7 @@ def test_a_perturbed_start_is_scored_on_the_same_frames(world):
     environment, _, episodes, plans = world
     config = EvaluationConfig(device="cpu")
     evaluator = Evaluator(None, environment.card, build_metrics(["mse"]), config)
-    rows, found = perturbed_rows(evaluator, environment, plans, episodes)
+    rows, found = perturbed(evaluator, environment, plans, episodes)
     assert [row.frames for row in rows] == [24 - GIVEN + 1] * 2
     assert len(found.share) == 24 - GIVEN + 1
 
@@ -157,7 +157,7 @@ def test_a_model_trained_for_it_carries_its_state_through_whole_episodes(recurre
     actions = torch.tensor(episode.actions)[None]
 
     def found():
-        rows = read_results(recurrent)
+        rows = read_scores(recurrent)
         return next(r for r in rows if (r.split, r.episode, r.kind) == ("ind_test", 0, "model"))
 
     def mse(**how):
@@ -180,7 +180,7 @@ def test_the_published_protocol_predicts_windows_from_one_frame():
 
 
 def test_more_frames_may_be_given_than_a_response_usually_has(run, monkeypatch):
-    monkeypatch.setattr("acwm_core.evaluation.simulator.CLIP_FRAMES", 4)
+    monkeypatch.setattr("acwm_core.evaluation.interventions.CLIP_FRAMES", 4)
     asked = ["evaluation.counterfactual_metrics=[response]", "evaluation.counterfactual_episodes=2"]
     summary = evaluate_run(run, overrides=asked, overwrite=True, progress=False)
     found = summary.splits["ind_test"].counterfactual

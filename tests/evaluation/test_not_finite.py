@@ -12,10 +12,10 @@ from safetensors.torch import load_file, save_file
 
 from acwm_core.cli.main import main
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.evaluator import Evaluator
+from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import RunFolder, load_run
 from acwm_report.comparison import compare_runs
@@ -35,11 +35,11 @@ def failing(data, tmp_path_factory):
     folder = tiny.make_run(tmp_path_factory.mktemp("runs") / "failing", data, **tiny.SWEEP)
     healthy = Evaluator.predict
 
-    def predict(self, batch, predictors):
-        made = healthy(self, batch, predictors)
-        if "model" in made and len(made) > 1:
-            made["model"] = made["model"].clone()
-            made["model"][0, 5, 1, 3, 4] = torch.nan
+    def predict(self, truths, kinds, donated=()):
+        made = healthy(self, truths, kinds, donated)
+        if len(kinds) > 1:
+            for each in [each for each in made if each.kind == "model"][:1]:
+                each.video[5, 1, 3, 4] = torch.nan
         return made
 
     with pytest.MonkeyPatch.context() as patched:
@@ -59,9 +59,9 @@ def test_one_nan_in_one_pixel_makes_the_whole_score_infinitely_bad(failing):
     assert np.isfinite(scores.rows["shuffled"]["psnr"].value)
     assert scores.paired["copy"]["psnr"].difference.value == -math.inf
     assert scores.paired["copy"]["psnr"].clips == scores.clips
-    clip = next(r for r in read_results(failing) if r.failed)
+    clip = next(r for r in read_scores(failing) if r.failed)
     assert (clip.kind, clip.values["psnr"], clip.values["mse"]) == ("model", -math.inf, math.inf)
-    others = [r for r in read_results(failing) if not r.failed]
+    others = [r for r in read_scores(failing) if not r.failed]
     assert all(np.isfinite(r.values["psnr"]) for r in others)
 
 
@@ -146,6 +146,6 @@ def test_scores_of_old_have_no_counts_and_are_read(evaluated, tmp_path):
 
 def test_what_is_not_defined_is_counted(evaluated):
     counts = Summary.read(evaluated).splits["ind_test"].scores.undefined
-    model = [r for r in read_results(evaluated) if (r.split, r.kind) == ("ind_test", "model")]
+    model = [r for r in read_scores(evaluated) if (r.split, r.kind) == ("ind_test", "model")]
     by_hand = {n: sum(math.isnan(r.values[n]) for r in model) for n in model[0].values}
     assert counts == {name: count for name, count in by_hand.items() if count}

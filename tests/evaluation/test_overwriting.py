@@ -10,10 +10,9 @@ from acwm_core.cli.main import main
 from acwm_core.data.atomic import held
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clip_results import EPISODES, read_results
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.replacing import replacing_result, result_file
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
+from acwm_core.evaluation.storage import EPISODES, read_scores, replacing_result, result_file
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
 from acwm_severity.sweep import sweep_severity
@@ -143,14 +142,14 @@ def test_a_result_that_is_replaced_is_the_old_or_the_new_one_at_every_moment(dat
 
 def test_what_a_killed_evaluation_left_is_used_and_then_put_in_place(run):
     folder = run / FOLDER
-    rows = read_results(run)
+    rows = read_scores(run)
     waiting = folder / f".result-{file_sha256(folder / SUMMARY)}"
     waiting.mkdir()
     (folder / EPISODES).replace(waiting / EPISODES)
     (folder / ".result-new").mkdir()
-    assert read_results(run) == rows
+    assert read_scores(run) == rows
     with pytest.raises(ZeroDivisionError), replacing_result(folder):
         raise ZeroDivisionError
-    assert read_results(run) == rows
+    assert read_scores(run) == rows
     assert (folder / EPISODES).is_file()
     assert [*folder.glob(".result-*")] == []

@@ -9,11 +9,11 @@ import pytest
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation import provenance
-from acwm_core.evaluation.clip_results import read_rows, write_results
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
-from acwm_core.evaluation.provenance import KEPT, package_hash, references_file
+from acwm_core.evaluation.references import KEPT, package_hash, references_file
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.storage import load_scores, write_scores
 from acwm_core.training.run import RunFolder
 from tests.evaluation import tiny
 
@@ -76,8 +76,8 @@ def test_what_cannot_be_kept_or_read_is_scored_again(own, harm):
 
 
 def forged(path, change):
-    rows = read_rows(path)
-    write_results(path, [change(row) for row in rows])
+    rows = load_scores(path)
+    write_scores(path, [change(row) for row in rows])
 
 
 @pytest.mark.parametrize(

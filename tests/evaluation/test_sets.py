@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.metric import SetMetric
 from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import catalog, hookimpl
 from acwm_severity.curves import read_severity
 from acwm_severity.sweep import sweep_severity
@@ -27,8 +27,8 @@ class Colours(SetMetric):
     def __init__(self, *, scale: float = 1.0):
         self.scale = scale
 
-    def features(self, rollout):
-        clips = (rollout.prediction, rollout.target)
+    def features(self, prediction):
+        clips = (prediction.video, prediction.target)
         return np.stack([clip.mean((0, 2, 3)).numpy() for clip in clips])
 
     def distance(self, features):
@@ -65,7 +65,7 @@ def colourful(data, tmp_path_factory):
 
 
 def test_a_set_is_scored_as_one(colourful):
-    summary, results = Summary.read(colourful), read_results(colourful)
+    summary, results = Summary.read(colourful), read_scores(colourful)
     for split, each in summary.splits.items():
         for row in ("model", "copy"):
             rows = [r for r in results if (r.split, r.kind) == (split, row)]
@@ -101,7 +101,7 @@ def test_one_metric_is_measured_in_two_ways(colourful):
 
 
 def test_a_metric_of_torchmetrics_is_measured(colourful):
-    scores = [each for each in read_results(colourful) if each.kind == "codec"]
+    scores = [each for each in read_scores(colourful) if each.kind == "codec"]
     assert all(0 < each.values["uniform_ssim"] <= 1 for each in scores)
     assert all(len(each.curves["uniform_ssim"]) == each.frames for each in scores)
 

@@ -8,17 +8,17 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clips import ClipPlan
+from acwm_core.evaluation.clips import Clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Evaluator
-from acwm_core.evaluation.scoring import build_metrics
-from acwm_core.evaluation.simulator import (
-    ask_simulator,
-    perturbed_rows,
+from acwm_core.evaluation.interventions import (
+    intervene,
+    perturbed,
     predictability,
     simulator_of,
     units_of_work,
 )
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.score import build_metrics
 from tests.evaluation import tiny
 from tests.evaluation.test_counterfactual import Episodes
 
@@ -31,23 +31,23 @@ class Chaos(Disc):
         self.position = (turns % 1) * 0.8 - 0.4
 
 
-def perturbed(environment, frames=24, clips=3):
+def rows_of(environment, frames=24, clips=3):
     specs = [EpisodeSpec("disc", "ind_test", index) for index in range(clips)]
     episodes = Episodes(simulate(environment, spec) for spec in specs)
     plans = [
-        ClipPlan("ind_test", i, 0, frames, donor=(i + 1) % clips, donor_start=0, seed=i)
+        Clip("ind_test", i, 0, frames, donor=(i + 1) % clips, donor_start=0, seed=i)
         for i in range(clips)
     ]
     config = EvaluationConfig(device="cpu")
     told, metrics = [], build_metrics(["mse", "psnr"])
     evaluator = Evaluator(None, environment.card, metrics, config, advance=told.append)
-    found = perturbed_rows(evaluator, environment, plans, episodes)
+    found = perturbed(evaluator, environment, plans, episodes)
     assert told == [1] * clips
     return found
 
 
 def test_a_tame_world_is_predictable_to_the_end():
-    rows, found = perturbed(Disc(size=(32, 48)))
+    rows, found = rows_of(Disc(size=(32, 48)))
     assert [row.kind for row in rows] == ["perturbed"] * 3
     assert all(0 < row.values["mse"] < 1e-4 for row in rows)
     assert found.clips == 3
@@ -57,7 +57,7 @@ def test_a_tame_world_is_predictable_to_the_end():
 
 
 def test_a_chaotic_world_is_predictable_for_as_long_as_differences_take_to_grow():
-    _, found = perturbed(Chaos(size=(32, 48)))
+    _, found = rows_of(Chaos(size=(32, 48)))
     assert found.share[2] < 0.1
     # A millimetre grows to the disc's radius of a decimetre in log2(100) steps.
     assert 5 <= found.horizon <= 9
@@ -125,11 +125,11 @@ def test_nothing_is_simulated_unless_it_is_asked_for(data, monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError
 
-    monkeypatch.setattr("acwm_core.evaluation.simulator.simulator_of", refuse)
+    monkeypatch.setattr("acwm_core.evaluation.interventions.simulator_of", refuse)
     config = EvaluationConfig(counterfactual_episodes=0, perturbed_episodes=0, device="cpu")
     evaluator = Evaluator(None, tiny.Drift.card, {}, config)
     plans, episodes = {"ind_test": []}, {"ind_test": EpisodeDataset(data, "ind_test")}
     assert units_of_work(evaluator, plans) == 0
-    found = ask_simulator(evaluator, plans, episodes)
+    found = intervene(evaluator, plans, episodes)
     assert not found.left_out
     assert not found.counterfactual

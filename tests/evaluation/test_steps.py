@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.evaluation.clip_results import read_results
+from acwm_core.data.episodes import EpisodeDataset
 from acwm_core.evaluation.clips import noise_seed
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from acwm_report.page import write_report
 from tests.evaluation import tiny
@@ -50,7 +50,7 @@ def test_the_curve_is_that_of_an_independent_computation(evaluated, data, split)
 
 
 def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):
-    rows = [r for r in read_results(evaluated) if r.kind == "model" and r.split == "ind_test"]
+    rows = [r for r in read_scores(evaluated) if r.kind == "model" and r.split == "ind_test"]
     point = Summary.read(evaluated).splits["ind_test"].steps.points[1]
     assert point.steps == load_run(evaluated).world_model.objective.steps
     expected = np.mean([row.values["mse"] for row in rows if row.episode < 3])

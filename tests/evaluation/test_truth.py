@@ -5,12 +5,12 @@ import pytest
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.physics import Observation, Physics, StateEstimator
-from acwm_core.evaluation.clip_results import summarise_split
-from acwm_core.evaluation.clips import ClipPlan, plan_clips
+from acwm_core.evaluation.clips import Clip, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluator import Evaluator
 from acwm_core.evaluation.metric import Metric
-from acwm_core.evaluation.scoring import build_metrics, measured_in, split_available
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.score import build_metrics, measured_in, split_available
+from acwm_core.evaluation.summarise import summarise_split
 from acwm_core.training.run import load_run
 
 OFF = 0.25
@@ -43,9 +43,9 @@ class CornerError(Metric):
     def unavailable(self, card, estimator):
         return None if estimator else "no estimator reads this"
 
-    def per_frame(self, rollout):
-        true = np.asarray(rollout.states["position"], float).round()
-        return np.abs(rollout.observed.states["position"] - true).mean(-1)
+    def per_frame(self, prediction):
+        true = np.asarray(prediction.states["position"], float).round()
+        return np.abs(prediction.observed.states["position"] - true).mean(-1)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_no_noise_floor_at_all_may_be_asked_for(evaluated, data):
 def test_what_ranks_clips_is_measured_under_wrong_actions_too(evaluated, names):
     card = load_run(evaluated).card
     metrics = {"corner_error": CornerError(), **build_metrics(names)}
-    plan = ClipPlan("ind_test", 0, 0, 9, 1, 0, seed=0, noise_floor=False)
+    plan = Clip("ind_test", 0, 0, 9, 1, 0, seed=0, noise_floor=False)
     for kind in ("shuffled", "codec", "model"):
         assert list(measured_in(kind, plan, metrics, card)) == ["corner_error", *names]
 

@@ -1,7 +1,7 @@
 """Imported recordings train and are evaluated with several given frames."""
 
-from acwm_core.evaluation.clip_results import read_results
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from tests.formats.test_command_line import QUICK, QUICK_EVALUATION, run
 
@@ -19,6 +19,6 @@ def test_an_imported_dataset_is_learnt_and_scored_from_five_frames(tmp_path):
     run("evaluate", folder, *QUICK_EVALUATION)
     assert load_run(folder).world_model.context_frames == GIVEN
     assert Summary.read(folder).provenance["context_frames"] == GIVEN
-    rows = [row for row in read_results(folder) if row.kind == "model"]
+    rows = [row for row in read_scores(folder) if row.kind == "model"]
     assert {row.split for row in rows} == {"ind_test"}
     assert {row.frames for row in rows} == {9 - GIVEN + 1}

@@ -5,7 +5,7 @@ import torch
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.physics import Observation, Physics, StateEstimator
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 
 SIDE = 32
 
@@ -46,7 +46,7 @@ def card_of(instances, fps=10):
 
 
 def clip(physics=None, *, seen=None, true=None, states=None, read=None, contacts=(), names=()):
-    """A rollout in which `seen` masks and `read` states are observed; the truth unless given."""
+    """A prediction in which `seen` masks and `read` states are observed; the truth unless given."""
     true = seen if true is None else true
     frames = len(true) if true is not None else len(next(iter((states or read).values())))
     true = np.zeros((frames, SIDE, SIDE), np.uint8) if true is None else true
@@ -54,8 +54,8 @@ def clip(physics=None, *, seen=None, true=None, states=None, read=None, contacts
     card = card_of(names)
     observation = Observation(seen, states | (read or {}))
     video = torch.arange(frames)[:, None, None, None] / frames * torch.ones(3, SIDE, SIDE)
-    return Rollout(
-        prediction=video,
+    return Prediction(
+        video=video,
         target=video,
         actions=np.zeros((frames, 1), np.float32),
         states=states,

@@ -43,25 +43,25 @@ def test_true_contacts_are_all_right():
 
 
 def test_one_missed_one_invented_one_late():
-    rollout = seen(touching((8, 9), (50, 51)), touching((5, 9), (30, 33)))
-    assert ContactPrecision().value(rollout) == 0.5
-    assert ContactRecall().value(rollout) == 0.5
-    assert ContactTiming().value(rollout) == pytest.approx(0.3)
-    assert ContactTimingInFrames().value(rollout) == 3
-    assert np.flatnonzero(~np.isnan(ContactRecall().per_frame(rollout))).tolist() == [5, 30]
-    assert ContactPrecision().per_frame(rollout)[[8, 50]].tolist() == [1, 0]
+    prediction = seen(touching((8, 9), (50, 51)), touching((5, 9), (30, 33)))
+    assert ContactPrecision().value(prediction) == 0.5
+    assert ContactRecall().value(prediction) == 0.5
+    assert ContactTiming().value(prediction) == pytest.approx(0.3)
+    assert ContactTimingInFrames().value(prediction) == 3
+    assert np.flatnonzero(~np.isnan(ContactRecall().per_frame(prediction))).tolist() == [5, 30]
+    assert ContactPrecision().per_frame(prediction)[[8, 50]].tolist() == [1, 0]
 
 
 def test_too_late_is_not_the_same_contact():
-    rollout = seen(touching((11, 20)), touching((5, 20)))
-    assert ContactPrecision().value(rollout) == ContactRecall().value(rollout) == 0
-    assert np.isnan(ContactTiming().value(rollout))
+    prediction = seen(touching((11, 20)), touching((5, 20)))
+    assert ContactPrecision().value(prediction) == ContactRecall().value(prediction) == 0
+    assert np.isnan(ContactTiming().value(prediction))
 
 
 def test_no_event_is_no_score_and_no_weight():
-    rollout = seen(touching(), touching((0, 20)))  # being in contact at first is no event
-    assert np.isnan(ContactRecall().value(rollout))
-    assert ContactRecall().weight(rollout) == 0
+    prediction = seen(touching(), touching((0, 20)))  # being in contact at first is no event
+    assert np.isnan(ContactRecall().value(prediction))
+    assert ContactRecall().weight(prediction) == 0
 
 
 def test_the_summary_is_that_of_all_events():

@@ -15,7 +15,7 @@ from acwm_core.checks import check_metric
 from acwm_core.errors import DataError
 from acwm_metrics.fvd import FVD, frechet_distance
 from acwm_metrics.lpips import LPIPS, NETWORKS
-from tests.metrics.test_pixel import rollout
+from tests.metrics.test_pixel import predicted
 
 ALEX = [
     *(nn.Conv2d(3, 6, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)),
@@ -73,7 +73,7 @@ def clips(frames=3, size=40, seed=1):
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(frames, 3, size, size + 8, generator=generator)
     noise = torch.randn(target.shape, generator=generator) * 0.2
-    return rollout((target + noise).clamp(0, 1), target)
+    return predicted((target + noise).clamp(0, 1), target)
 
 
 def by_parts(network, clip):

@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.errors import ShapeError
-from acwm_core.evaluation.metric import Rollout
+from acwm_core.evaluation.metric import Prediction
 from acwm_core.plugins import catalog
 from acwm_metrics.pixel import MSE, PSNR, SSIM, MaskedMSE, MeanPSNR
 from acwm_metrics.plugin import LIBRARIES
@@ -21,7 +21,7 @@ REFERENCE = Path(__file__).parent.parent / "reference"
 METRICS = {"mse": MSE, "m_mse": MaskedMSE, "psnr": PSNR, "ssim": SSIM}
 
 
-def rollout(prediction, target):
+def predicted(prediction, target):
     frames, _, height, width = target.shape
     card = EnvironmentCard(
         name="test",
@@ -36,8 +36,8 @@ def rollout(prediction, target):
         instances=(),
         engine="",
     )
-    return Rollout(
-        prediction=prediction,
+    return Prediction(
+        video=prediction,
         target=target,
         actions=np.zeros((frames, 1), np.float32),
         states={},
@@ -52,7 +52,7 @@ def published():
     clips = load_file(REFERENCE / "metrics.safetensors")
     pairs = zip(clips["pred"].movedim(-1, 2), clips["gt"].movedim(-1, 2), strict=True)
     values = json.loads((REFERENCE / "metrics.json").read_text())
-    return [rollout(prediction, target) for prediction, target in pairs], values
+    return [predicted(prediction, target) for prediction, target in pairs], values
 
 
 @pytest.fixture
@@ -61,22 +61,22 @@ def noisy():
     target = torch.rand(5, 3, 12, 10, generator=generator)
     noise = torch.randn(5, 3, 12, 10, generator=generator)
     scale = torch.linspace(0.01, 0.2, 5)[:, None, None, None]
-    return rollout((target + noise * scale).clamp(0, 1), target)
+    return predicted((target + noise * scale).clamp(0, 1), target)
 
 
 @pytest.mark.parametrize("name", METRICS)
 def test_published_values_per_video(published, name):
-    rollouts, expected = published
-    for clip, values in zip(rollouts, expected["per_video"], strict=True):
+    predictions, expected = published
+    for clip, values in zip(predictions, expected["per_video"], strict=True):
         assert METRICS[name]().value(clip) == pytest.approx(values[name], abs=1e-6, rel=0)
 
 
 @pytest.mark.parametrize("name", METRICS)
 def test_published_values_pooled(published, name):
-    rollouts, expected = published
+    predictions, expected = published
     metric = METRICS[name]()
-    values = [metric.value(clip) for clip in rollouts]
-    weights = [metric.weight(clip) for clip in rollouts]
+    values = [metric.value(clip) for clip in predictions]
+    weights = [metric.weight(clip) for clip in predictions]
     pooled = metric.summarise(values, weights)
     assert pooled == pytest.approx(expected["batch"][name], abs=1e-6, rel=0)
 
@@ -89,7 +89,7 @@ def test_masked_mse_by_hand():
     prediction[0, :, 0, 1] -= 0.4  # … and one where nothing does
     weights = 0.51 + 0.01
     frames = [0.01 * 0.16 / weights, 0.51 * 0.09 / weights]
-    clip = rollout(prediction, target)
+    clip = predicted(prediction, target)
     np.testing.assert_allclose(MaskedMSE().per_frame(clip), frames, rtol=1e-6)
     assert MaskedMSE().value(clip) == pytest.approx(sum(frames) / 2, rel=1e-6)
 
@@ -120,7 +120,7 @@ def test_ssim_is_that_of_scikit_image(size):
     prediction = np.clip(target + 0.1 * rng.standard_normal(target.shape, np.float32), 0, 1)
     prediction[2] = target[2][:, ::-1]  # as unlike as it gets
     prediction[3] = 0.2
-    scores = SSIM().per_frame(rollout(torch.tensor(prediction), torch.tensor(target)))
+    scores = SSIM().per_frame(predicted(torch.tensor(prediction), torch.tensor(target)))
     for true, seen, score in zip(
         target.astype(float), prediction.astype(float), scores, strict=True
     ):
@@ -133,7 +133,7 @@ def test_ssim_is_that_of_scikit_image(size):
 
 def test_a_perfect_prediction():
     target = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(1))
-    clip = rollout(target.clone(), target)
+    clip = predicted(target.clone(), target)
     assert MSE().value(clip) == MaskedMSE().value(clip) == 0
     assert SSIM().value(clip) == pytest.approx(1)
     assert PSNR().value(clip) == pytest.approx(80)
@@ -142,7 +142,7 @@ def test_a_perfect_prediction():
 
 def test_a_still_video_weighs_every_pixel_alike():
     target = torch.full((3, 3, 8, 8), 0.5)
-    clip = rollout(target + 0.1 * torch.rand(3, 3, 8, 8), target)
+    clip = predicted(target + 0.1 * torch.rand(3, 3, 8, 8), target)
     assert MaskedMSE().value(clip) == pytest.approx(MSE().value(clip))
 
 
@@ -155,13 +155,13 @@ def test_half_precision_inside_autocast_changes_nothing(noisy, metric):
 
 @pytest.mark.parametrize("metric", [MSE, MaskedMSE, PSNR, SSIM])
 def test_clips_of_different_shape_are_refused(metric):
-    clip = rollout(torch.zeros(2, 3, 8, 8), torch.zeros(3, 3, 8, 8))
+    clip = predicted(torch.zeros(2, 3, 8, 8), torch.zeros(3, 3, 8, 8))
     with pytest.raises(ShapeError, match=r"\[2, 3, 8, 8\] with \[3, 3, 8, 8\]"):
         metric().value(clip)
 
 
 def test_ssim_refuses_frames_below_its_window():
-    clip = rollout(torch.zeros(2, 3, 6, 9), torch.zeros(2, 3, 6, 9))
+    clip = predicted(torch.zeros(2, 3, 6, 9), torch.zeros(2, 3, 6, 9))
     with pytest.raises(ShapeError, match="6×9"):
         SSIM().value(clip)
 

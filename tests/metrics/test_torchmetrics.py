@@ -11,11 +11,11 @@ from torchmetrics.image import PeakSignalNoiseRatio
 from acwm_core.checks import check_metric
 from acwm_core.errors import PluginError, RecipeError, ShapeError
 from acwm_core.evaluation.metric import SetMetric
-from acwm_core.evaluation.scoring import build_metrics
+from acwm_core.evaluation.score import build_metrics
 from acwm_core.plugins import catalog
 from acwm_metrics.torchmetrics import TorchMetric, as_torchmetric
 from tests.metrics.seeing import boxes, clip
-from tests.metrics.test_pixel import rollout
+from tests.metrics.test_pixel import predicted
 
 IMAGE = "torchmetrics.image"
 PSNR, SSIM = f"{IMAGE}.PeakSignalNoiseRatio", f"{IMAGE}.StructuralSimilarityIndexMeasure"
@@ -37,7 +37,7 @@ def test_its_scores_are_those_of_torchmetrics():
         structural_similarity_index_measure(*pair, kernel_size=5, data_range=1.0).item()
         for pair in zip(prediction.split(1), target.split(1), strict=True)
     ]
-    clip = rollout(prediction, target)
+    clip = predicted(prediction, target)
     np.testing.assert_allclose(metric.per_frame(clip), functional, rtol=1e-6)
     assert metric.value(clip) == pytest.approx(np.mean(functional), rel=1e-5)
     pooled = TorchMetric(PSNR).value(clip)
@@ -80,7 +80,7 @@ def test_what_cannot_score_pictures_is_refused(target, params, message):
     [f"{IMAGE}.MultiScaleStructuralSimilarityIndexMeasure", f"{IMAGE}.QualityWithNoReference"],
 )
 def test_what_takes_no_such_frames_is_left_out_with_a_sentence(target):
-    card = rollout(*(video[0] for video in videos())).card
+    card = predicted(*(video[0] for video in videos())).card
     assert f"{target} takes no frames of 32×32" in TorchMetric(target).unavailable(card, None)
     assert TorchMetric(SSIM).unavailable(card, None) is None
 
@@ -93,7 +93,7 @@ def test_ours_sum_up_as_an_evaluation_does(name):
     for batch in (slice(0, 2), slice(2, 4)):
         metric.update(prediction[batch], target[batch])
     metric.update(prediction[4], target[4])
-    clips = [rollout(*pair) for pair in zip(prediction, target, strict=True)]
+    clips = [predicted(*pair) for pair in zip(prediction, target, strict=True)]
     values, weights = ([f(each) for each in clips] for f in (ours.value, ours.weight))
     assert metric.compute().item() == pytest.approx(ours.summarise(values, weights), rel=1e-6)
     metric.reset()
@@ -133,8 +133,8 @@ class Colours(SetMetric):
     name = "colours"
     reads = "pixels"
 
-    def features(self, rollout):
-        return np.stack([c.mean((0, 2, 3)).numpy() for c in (rollout.prediction, rollout.target)])
+    def features(self, prediction):
+        return np.stack([c.mean((0, 2, 3)).numpy() for c in (prediction.video, prediction.target)])
 
     def distance(self, features):
         made, true = features.mean(0)
@@ -146,7 +146,7 @@ def test_metrics_of_sets_and_of_states_work_too():
     metric, features = as_torchmetric(Colours()), []
     metric.update(prediction, target)
     for pair in zip(prediction, target, strict=True):
-        features.append(Colours().features(rollout(*pair)))
+        features.append(Colours().features(predicted(*pair)))
     assert metric.compute().item() == pytest.approx(Colours().distance(np.stack(features)))
     with pytest.raises(PluginError, match="mask_iou cannot be measured: it reads states"):
         as_torchmetric("mask_iou")

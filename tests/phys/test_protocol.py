@@ -2,6 +2,7 @@
 
 import json
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,15 @@ from acwm_core.cli.main import main
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.clip_results import read_results, summarise
-from acwm_core.evaluation.clips import ClipPlan, Sample, cut_episode, noise_seed, plan_clips
+from acwm_core.evaluation.clips import Clip, cut_episode, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.protocol import Protocol
 from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.scoring import Prediction, build_metrics, score
+from acwm_core.evaluation.score import build_metrics, score
+from acwm_core.evaluation.storage import read_scores
+from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run import load_run
 from acwm_phys.protocol import PublishedWindows
 from acwm_report.evaluate import evaluate
@@ -128,9 +131,7 @@ def windowed(data, tmp_path_factory):
 
 def test_every_window_is_predicted_from_its_own_first_frame(windowed, data):
     world_model = load_run(windowed).world_model
-    results = {
-        (r.split, r.episode, r.start): r for r in read_results(windowed) if r.kind == "model"
-    }
+    results = {(r.split, r.episode, r.start): r for r in read_scores(windowed) if r.kind == "model"}
     for split, episodes in (("ind_test", 5), ("ood_test", 4)):
         for episode in random.Random(0).sample(range(episodes), 3):
             whole = EpisodeDataset(data, split)[episode]
@@ -155,7 +156,7 @@ def test_windows_are_pooled_and_episodes_resampled(windowed):
     assert summary.provenance["evaluation"]["cuts"] == 3
     assert summary.provenance["sampling_steps"] == 2
     for split, result in summary.splits.items():
-        rows = [r for r in read_results(windowed) if (r.split, r.kind) == (split, "model")]
+        rows = [r for r in read_scores(windowed) if (r.split, r.kind) == (split, "model")]
         errors = np.array([r.values["mse"] for r in rows])
         scores = result.scores
         assert (scores.clips, scores.episodes) == (9, 3)
@@ -180,7 +181,7 @@ def test_the_sweep_over_steps_takes_one_window_of_each_episode(data, tmp_path):
     run = tiny.make_run(tmp_path / "sweep", data, **settings)
     summary = evaluate_run(run, progress=False, overrides=["evaluation.splits=[ind_test]"])
     curve = summary.splits["ind_test"].steps
-    rows = [r for r in read_results(run) if r.kind == "model" and r.start == 0][:2]
+    rows = [r for r in read_scores(run) if r.kind == "model" and r.start == 0][:2]
     assert curve.clips == 2
     expected = np.mean([r.values["mse"] for r in rows])
     assert curve.points[1].scores["mse"].value == pytest.approx(expected, rel=1e-6)
@@ -191,7 +192,7 @@ def test_the_protocol_is_a_word_of_the_command_line(data, tmp_path):
     words = [f"evaluation.{n}={v}" for n, v in SMALL.items() if n != "protocol"]
     outcome = CliRunner().invoke(evaluate, [str(run), *words, "--protocol", "acwm-phys"])
     assert outcome.exit_code == 0, outcome.output
-    assert {r.start for r in read_results(run)} == {0, 4, 8}
+    assert {r.start for r in read_scores(run)} == {0, 4, 8}
     outcome = CliRunner().invoke(main, ["evaluate", str(run), "--protocol", "acwm_phys"])
     assert outcome.exit_code == 2
     assert "evaluation.protocol: unknown 'acwm_phys'; did you mean 'acwm-phys'?" in outcome.output
@@ -217,10 +218,10 @@ def test_published_values_come_out_of_the_summary(card):
     results = []
     for number, (made, true) in enumerate(zip(clips["pred"], clips["gt"], strict=True)):
         frames = len(true)
-        plan = ClipPlan("ind_test", number, 0, frames, 1 - number, 0, 0)
-        episode = numbered(frames, [])
-        sample = Sample(plan, episode, true.movedim(-1, 1), episode.actions)
-        results.append(score(Prediction(sample, "model", made.movedim(-1, 1)), metrics, card))
+        plan = Clip("ind_test", number, 0, frames, 1 - number, 0, 0)
+        videos = made.movedim(-1, 1), true.movedim(-1, 1)
+        prediction = Prediction.of(numbered(frames, []), *videos, card)
+        results.append(score(replace(prediction, clip=plan), metrics))
     for result, values in zip(results, expected["per_video"], strict=True):
         for name, value in values.items():
             assert result.values[name] == pytest.approx(value, abs=1e-6, rel=0)

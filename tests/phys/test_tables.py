@@ -8,10 +8,7 @@ from collections import defaultdict
 import pytest
 from click.testing import CliRunner
 
-from acwm_core.evaluation.benchmark import (
-    published_for,
-    published_tables,
-)
+from acwm_core.evaluation.benchmark import published_for, published_tables
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
 from acwm_report.evaluate import evaluate

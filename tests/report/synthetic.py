@@ -2,15 +2,10 @@
 
 import numpy as np
 
-from acwm_core.evaluation.clip_results import (
-    EPISODES,
-    ClipResult,
-    gap,
-    summarise_split,
-    write_results,
-)
 from acwm_core.evaluation.metric import Metric
-from acwm_core.evaluation.results import FOLDER, Summary
+from acwm_core.evaluation.results import FOLDER, Score, Summary
+from acwm_core.evaluation.storage import EPISODES, write_scores
+from acwm_core.evaluation.summarise import gap, summarise_split
 
 SEED, FRAMES, FPS = 0, 5, 10
 
@@ -38,7 +33,7 @@ METRICS = {"mse": Error(), "psnr": Quality()}
 
 def clip(kind, episode, psnr, *, split="ind_test", start=0, frames=FRAMES):
     error = 10.0 ** (-psnr / 10)
-    return ClipResult(
+    return Score(
         split=split,
         episode=episode,
         start=start,
@@ -90,7 +85,7 @@ def run(path, results, *, environment="drift", protocol="full", **provenance):
     folder = path / FOLDER
     folder.mkdir(parents=True)
     (path / "recipe.yaml").write_text("model: dit\n")
-    write_results(folder / EPISODES, results)
+    write_scores(folder / EPISODES, results)
     summary.write(folder)
     return path
 

@@ -14,7 +14,7 @@ from acwm_core.evaluation.results import (
     Estimate,
     MetricInfo,
     Paired,
-    Scores,
+    SetSummary,
     SplitSummary,
     Summary,
 )
@@ -163,7 +163,7 @@ def run_of(copy, shuffled):
         row: {"psnr": Paired(Estimate(*gain), 9, 10)}
         for row, gain in {"copy": copy, "shuffled": shuffled}.items()
     }
-    splits = {"ind_test": SplitSummary(Scores(10, {}, paired), {}, {})}
+    splits = {"ind_test": SplitSummary(SetSummary(10, {}, paired), {}, {})}
     summary = Summary("run", {}, {"psnr": MetricInfo("dB", True)}, "psnr", splits, {}, {})
     return EvaluatedRun(Path("run"), summary, [], "run1")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.evaluation.scoring import estimator_for
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
 from tests.tasks.playing import begin, like, make, seen, solve, spec_of
 

@@ -15,8 +15,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.shards import open_shard
 from acwm_core.env.card import ActionSpec
-from acwm_core.evaluation.clip_results import read_rows
 from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.storage import load_scores
 from acwm_core.recipe import compose
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.plain_tensors import load_plain
@@ -152,7 +152,7 @@ def manifest(folder, seed):
 def parquet(folder, seed):
     whole = (RUN / "evaluation/episodes.parquet").read_bytes()
     footer = whole[:-3000] + damaged(whole[-3000:], seed)
-    read_rows(place(folder, "x.parquet", damaged(whole, seed) if seed % 2 else footer))
+    load_scores(place(folder, "x.parquet", damaged(whole, seed) if seed % 2 else footer))
 
 
 def lerobot(folder, seed):

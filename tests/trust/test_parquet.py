@@ -59,13 +59,13 @@ def lying(path):
 
 
 def read_in_little_memory(path):
-    """What `read_rows` says of a file in a process of its own, and its peak of memory in MB."""
+    """What `load_scores` says of a file in a process of its own, and its peak of memory in MB."""
     program = f"""
         from pathlib import Path
         from acwm_core.errors import AcwmError
-        from acwm_core.evaluation.clip_results import read_rows
+        from acwm_core.evaluation.storage import load_scores
         try:
-            print(len(read_rows(Path({str(path)!r}))))
+            print(len(load_scores(Path({str(path)!r}))))
         except AcwmError as error:
             print(error)
         status = Path("/proc/self/status").read_text()

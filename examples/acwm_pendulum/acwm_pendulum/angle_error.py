@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 
 
 class AngleError(Metric):
@@ -14,10 +14,10 @@ class AngleError(Metric):
     unit = "°"
     group = "States"
 
-    def per_frame(self, rollout: Rollout) -> NDArray[np.float64]:
+    def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The error of each frame, `[T]`."""
-        truth = rollout.states["angle"].astype(np.float64)
-        red, green, blue = rollout.prediction.double().unbind(1)
+        truth = prediction.states["angle"].astype(np.float64)
+        red, green, blue = prediction.video.double().unbind(1)
         redness = (red - green.maximum(blue) - 0.2).clamp(min=0).numpy()
         rows, columns = redness.shape[1:]
         y, x = np.mgrid[:rows, :columns]

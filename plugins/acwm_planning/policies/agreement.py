@@ -10,8 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from acwm_core.evaluation.statistics import CONFIDENCE, MIN_EPISODES, Estimate, defined
-from acwm_core.evaluation.statistics.bootstrap import with_interval
+from acwm_core.evaluation.statistics import (
+    CONFIDENCE,
+    MIN_EPISODES,
+    Estimate,
+    defined,
+    with_interval,
+)
 from acwm_planning.policies.ranking import Agreement, Decisions
 
 Scores = NDArray[np.float64]

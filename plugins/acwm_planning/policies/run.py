@@ -16,9 +16,9 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.interventions import plan_branches
 from acwm_core.evaluation.results import write_json
-from acwm_core.evaluation.scoring import estimator_for
-from acwm_core.evaluation.simulator import plan_branches
+from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import progress_bar
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run

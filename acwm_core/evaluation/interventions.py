@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,23 +13,25 @@ from numpy.typing import NDArray
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.environment import ActionSpec, Environment
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.clips import ClipPlan, as_clip, cut_episode, load_samples
-from acwm_core.evaluation.counterfactual import (
+from acwm_core.evaluation.clips import Clip, as_clip, cut_episode, donor_actions, read_clips
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.responses import (
     ROWS,
     ActionRows,
     Branch,
-    Fan,
+    Simulated,
     counterfactual,
     pooled,
     ratio,
 )
-from acwm_core.evaluation.evaluator import Evaluator, ShownClip
-from acwm_core.evaluation.protocol import protocol_named
-from acwm_core.evaluation.results import Counterfactual, Predictability
-from acwm_core.evaluation.scoring import Prediction, build_metrics, score, split_available
+from acwm_core.evaluation.results import Counterfactual, Predictability, Score
+from acwm_core.evaluation.score import build_metrics, score, split_available
 from acwm_core.evaluation.statistics import finite
+from acwm_core.evaluation.videos import ShownClip
 from acwm_core.model.world_model import CLIP_FRAMES
 
 SIZES = (0.1, 0.5)
@@ -44,18 +47,18 @@ UNPREDICTABLE = 0.5
 """From this share on a frame counts as unpredictable: its squared error relative to that of
 repeating the first frame. Another episode of the same world has about 2, a perfect copy 0."""
 
-Plans = Mapping[str, Sequence[ClipPlan]]
+Clips = Mapping[str, Sequence[Clip]]
 """Clips by split."""
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """Results by split, and why a test or metric was left out, by its name.
+class Interventions:
+    """What the simulator has shown, by split, and why a test or metric was left out, by its name.
 
-    The rows are of the kind ``perturbed``; the videos show branches.
+    The scores are of the kind ``perturbed``; the videos show branches.
     """
 
-    rows: dict[str, list[ClipResult]] = field(default_factory=dict[str, list[ClipResult]])
+    scores: dict[str, list[Score]] = field(default_factory=dict[str, list[Score]])
     predictability: dict[str, Predictability] = field(default_factory=dict[str, Predictability])
     counterfactual: dict[str, Counterfactual] = field(default_factory=dict[str, Counterfactual])
     videos: list[ShownClip] = field(default_factory=list[ShownClip])
@@ -88,7 +91,7 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
     return environment
 
 
-def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
+def asked_clips(evaluator: Evaluator, clips: Clips) -> dict[str, Clips]:
     """The clips of each test, by test and split.
 
     The counterfactual test takes the first clips that start at their episode's first frame. The
@@ -98,61 +101,55 @@ def asked_plans(evaluator: Evaluator, plans: Plans) -> dict[str, Plans]:
     moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
     return {
         COUNTERFACTUAL: {
-            split: [plan for plan in each if plan.start == 0][: config.counterfactual_episodes]
-            for split, each in plans.items()
+            split: [clip for clip in each if clip.start == 0][: config.counterfactual_episodes]
+            for split, each in clips.items()
         },
-        PERTURBED: {split: each[:moved] for split, each in plans.items()},
+        PERTURBED: {split: each[:moved] for split, each in clips.items()},
     }
 
 
-def units_of_work(evaluator: Evaluator, plans: Plans) -> int:
-    """Upper bound of the progress that `ask_simulator` reports to `Evaluator.advance`, in rows."""
+def units_of_work(evaluator: Evaluator, clips: Clips) -> int:
+    """Upper bound of the progress that `intervene` reports to `Evaluator.advance`, in rows."""
     branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
-    count = {n: sum(map(len, each.values())) for n, each in asked_plans(evaluator, plans).items()}
+    count = {n: sum(map(len, each.values())) for n, each in asked_clips(evaluator, clips).items()}
     return branches * count[COUNTERFACTUAL] + count[PERTURBED]
 
 
-def ask_simulator(
-    evaluator: Evaluator, plans: Plans, datasets: Mapping[str, EpisodeDataset]
-) -> Simulated:
-    """Run the tests that need the simulator, if it is available and the config asks for them.
-
-    Raises:
-        RecipeError, UnknownNameError, MissingExtraError, PluginError: as `build_metrics`.
-    """
-    config, found = evaluator.config, Simulated()
+def intervene(
+    evaluator: Evaluator, clips: Clips, datasets: Mapping[str, EpisodeDataset]
+) -> Interventions:
+    """Run the tests that need the simulator, if it is available and the config asks for them."""
+    config, found = evaluator.config, Interventions()
     metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
-    asked = asked_plans(evaluator, plans)
-    wanted = {name: splits for name, splits in asked.items() if any(splits.values())}
+    asked = {n: s for n, s in asked_clips(evaluator, clips).items() if any(s.values())}
     if not metrics:
-        wanted.pop(COUNTERFACTUAL, None)
-    if not wanted:
+        asked.pop(COUNTERFACTUAL, None)
+    if not asked:
         return found
     try:
         environment = simulator_of(next(iter(datasets.values())))
     except DataError as error:
-        found.left_out.update(dict.fromkeys(sorted(wanted), str(error)))
+        found.left_out.update(dict.fromkeys(sorted(asked), str(error)))
         return found
-    if PERTURBED in wanted and not environment.can_be_perturbed:
-        found.left_out[PERTURBED] = f"{evaluator.card.name} has no perturbed start"
-        del wanted[PERTURBED]
-    try:
-        for split, few in wanted.get(COUNTERFACTUAL, {}).items():
+    with contextlib.closing(environment):
+        if PERTURBED in asked and not environment.can_be_perturbed:
+            found.left_out[PERTURBED] = f"{evaluator.card.name} has no perturbed start"
+            del asked[PERTURBED]
+        for split, few in asked.get(COUNTERFACTUAL, {}).items():
             if few:
                 usual = evaluator.given + CLIP_FRAMES - 1
                 frames = min(evaluator.world_model.clip_frames, usual)
                 kept, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
                 found.left_out.update(left_out)
-                fans = simulate_fans(environment, few, datasets[split], frames)
-                responses, videos = counterfactual(evaluator, kept, fans)
-                found.counterfactual[split] = responses
+                simulated = simulate_branches(
+                    environment, few, datasets[split], frames, evaluator.estimator
+                )
+                found.counterfactual[split], videos = counterfactual(evaluator, kept, simulated)
                 found.videos.extend(videos if config.videos else ())
-        for split, few in wanted.get(PERTURBED, {}).items():
-            found.rows[split], found.predictability[split] = perturbed_rows(
+        for split, few in asked.get(PERTURBED, {}).items():
+            found.scores[split], found.predictability[split] = perturbed(
                 evaluator, environment, few, datasets[split]
             )
-    finally:
-        environment.close()
     return found
 
 
@@ -196,49 +193,59 @@ def plan_branches(
     return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
 
 
-def simulate_fans(
-    environment: Environment, plans: Sequence[ClipPlan], episodes: EpisodeDataset, frames: int
-) -> Iterator[Fan]:
+def simulate_branches(
+    environment: Environment,
+    clips: Sequence[Clip],
+    episodes: EpisodeDataset,
+    frames: int,
+    estimator: StateEstimator | None = None,
+) -> Iterator[Simulated]:
     """Simulate each clip again, cut to at most `frames` frames, and its branches."""
-    for sample in load_samples(plans, episodes):
-        clip = cut_episode(sample.episode, 0, min(frames, len(sample.video)))
-        length = len(clip.video)
-        environment.reset(options={"spec": clip.spec})
-        free = slice(sample.plan.given - 1, length)
+    for clip, whole in read_clips(clips, episodes):
+        length = min(frames, len(whole.video))
+        episode = cut_episode(whole, 0, length)
+        environment.reset(options={"spec": episode.spec})
+        free = slice(clip.given - 1, length)
         branches = [
-            replace(branch, actions=np.concatenate([clip.actions[: free.start], branch.actions]))
+            replace(branch, actions=np.concatenate([episode.actions[: free.start], branch.actions]))
             for branch in plan_branches(
-                clip.actions[free],
-                sample.donor_actions[free],
+                episode.actions[free],
+                donor_actions(clip, whole.actions, episodes)[free],
                 environment.still_action(),
                 environment.card.action,
             )
         ]
-        asked = [clip.actions, *(branch.actions for branch in branches)]
-        made = [simulate(environment, clip.spec, rows, frames=length) for rows in asked]
-        yield Fan(sample.plan, made[0], branches, made[1:])
+        truths: list[Prediction] = []
+        for actions in [episode.actions, *(branch.actions for branch in branches)]:
+            made = simulate(environment, episode.spec, actions, frames=length)
+            video = as_clip(made.video)
+            truth = Prediction.of(made, video, video, environment.card, estimator)
+            truths.append(replace(truth, clip=clip, kind="truth"))
+        yield branches, replace(truths[0], branches=tuple(truths[1:]))
 
 
-def perturbed_rows(
+def perturbed(
     evaluator: Evaluator,
     environment: Environment,
-    plans: Sequence[ClipPlan],
+    clips: Sequence[Clip],
     episodes: EpisodeDataset,
-) -> tuple[list[ClipResult], Predictability]:
+) -> tuple[list[Score], Predictability]:
     """Simulate clips again from a slightly different start, and score this as a prediction."""
-    results: list[ClipResult] = []
+    scores: list[Score] = []
     errors: list[NDArray[np.float64]] = []
-    for sample in load_samples(plans, episodes):
-        clip, frames = sample.episode, len(sample.video)
-        moved = simulate(environment, clip.spec, clip.actions, frames=frames, perturbation=1.0)
-        video = as_clip(moved.video)
-        made = Prediction(sample, "perturbed", video)
-        results.append(score(made, evaluator.metrics, evaluator.card, evaluator.estimator))
-        _, truth, video = sample.plan.scored(clip, sample.video, video)
-        both = (video, truth[:1])
-        errors.append(np.stack([((each - truth) ** 2).mean((1, 2, 3)) for each in both]))
+    for clip, episode in read_clips(clips, episodes):
+        frames, target = len(episode.video), as_clip(episode.video)
+        moved = simulate(environment, episode.spec, episode.actions, frames=frames, perturbation=1)
+        made = Prediction.of(
+            episode, as_clip(moved.video), target, evaluator.card, evaluator.estimator
+        )
+        made = replace(made, clip=clip, kind="perturbed")
+        scores.append(score(made, evaluator.metrics))
+        shown = made.without(clip.given - 1)
+        both = (shown.video, shown.target[:1])
+        errors.append(np.stack([((each - shown.target) ** 2).mean((1, 2, 3)) for each in both]))
         evaluator.advance(1)
-    return results, predictability(errors)
+    return scores, predictability(errors)
 
 
 def predictability(errors: Sequence[NDArray[np.float64]]) -> Predictability:

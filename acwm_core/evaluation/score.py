@@ -1,22 +1,20 @@
-"""Scores of predicted clips by the metrics of the catalog."""
+"""`Score`: how well one clip was predicted, in the metrics that the recipe lists."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError, check_shape, noting
-from acwm_core.evaluation.clip_results import ClipResult
-from acwm_core.evaluation.clips import ClipPlan, Predictor, Sample
-from acwm_core.evaluation.metric import Metric, Rollout, SetMetric
-from acwm_core.model.shapes import Clip
+from acwm_core.evaluation.clips import Clip, Predictor
+from acwm_core.evaluation.metric import Metric, Prediction, SetMetric
+from acwm_core.evaluation.results import Score
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 
@@ -110,13 +108,13 @@ def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[
     return {n: m for n, m in metrics.items() if n == headline or not needs_estimator(m, card)}
 
 
-def predictors_for(plan: ClipPlan, predictors: Sequence[Predictor]) -> list[Predictor]:
+def predictors_for(clip: Clip, predictors: Sequence[Predictor]) -> list[Predictor]:
     """Those of `predictors` that apply to a clip; ``truth`` only if its noise floor is measured."""
-    return [each for each in predictors if each != "truth" or plan.noise_floor]
+    return [each for each in predictors if each != "truth" or clip.noise_floor]
 
 
 def measured_in(
-    predictor: Predictor, plan: ClipPlan, metrics: Mapping[str, Metric], card: EnvironmentCard
+    predictor: Predictor, clip: Clip, metrics: Mapping[str, Metric], card: EnvironmentCard
 ) -> dict[str, Metric]:
     """The metrics that are measured for a row of a clip; the others are undefined there.
 
@@ -126,91 +124,44 @@ def measured_in(
     """
     if predictor == "truth":
         return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
-    if predictor == "shuffled" or (predictor == "codec" and not plan.noise_floor):
+    if predictor == "shuffled" or (predictor == "codec" and not clip.noise_floor):
         return quick_metrics(metrics, card)
     return dict(metrics)
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """One row's predicted video of a clip, `[T, 3, H, W]`, float32 on the CPU."""
+def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
+    """Score a prediction with the metrics of its row, in float32 and outside any autocast.
 
-    sample: Sample
-    predictor: Predictor
-    video: Clip
-
-
-def score(
-    prediction: Prediction,
-    metrics: Mapping[str, Metric],
-    card: EnvironmentCard,
-    estimator: StateEstimator | None = None,
-) -> ClipResult:
-    """Score one prediction with the metrics of its row, in float32 and outside any autocast.
-
-    A prediction that is not finite gets the worst score in all of them.
+    Of the context frames, only the last is scored. A prediction that is not finite gets the worst
+    score in all metrics.
     """
-    sample = prediction.sample
-    measured = measured_in(prediction.predictor, sample.plan, metrics, card)
-    scored = sample.plan.scored(sample.episode, sample.video, prediction.video)
-    rollout = Rollout.of(*scored, card, estimator)
-    if not rollout.is_finite:
-        return _failed(prediction, rollout, measured, metrics)
-    curves, scores, sets = (
-        dict[str, NDArray[np.float64]](),
-        dict[str, tuple[float, float]](),
-        dict[str, Any](),
+    clip = prediction.clip
+    measured = measured_in(prediction.kind, clip, metrics, prediction.card)
+    shown = prediction.without(clip.given - 1)
+    frames = len(shown.target)
+    scored = Score(
+        split=clip.split,
+        episode=clip.episode,
+        start=clip.start,
+        ood_label=prediction.ood_label,
+        kind=prediction.kind,
+        frames=frames,
+        values=dict.fromkeys(metrics, math.nan),
+        weights=dict.fromkeys(metrics, 0.0),
+        curves=dict.fromkeys(metrics, [math.nan] * frames),
+        failed=not shown.is_finite,
     )
     with torch.autocast("cpu", enabled=False):
         for name, metric in measured.items():
-            with noting(f"in metric {name!r} {sample.plan.where}", metric):
-                curves[name] = metric.curve(rollout)
-                scores[name] = metric.scored(rollout, curves[name])
-                if isinstance(metric, SetMetric):
-                    sets[name] = np.asarray(metric.features(rollout))
-                    check_shape(metric, "features", sets[name], 2, -1)
-    values, weights = ({n: s[place] for n, s in scores.items()} for place in (0, 1))
-    undefined = [name for name in metrics if name not in measured]
-    curves |= dict.fromkeys(undefined, np.full(len(rollout.target), np.nan))
-    values |= dict.fromkeys(undefined, float("nan"))
-    weights |= dict.fromkeys(undefined, 0.0)
-    return ClipResult(
-        **_place(prediction, rollout),
-        values=values,
-        weights=weights,
-        curves={name: curve.astype(np.float32).tolist() for name, curve in curves.items()},
-        features={name: each.tolist() for name, each in sets.items()},
-    )
-
-
-def _failed(
-    prediction: Prediction,
-    rollout: Rollout,
-    measured: Mapping[str, Metric],
-    metrics: Mapping[str, Metric],
-) -> ClipResult:
-    """The result of a prediction that is not finite: the worst score in every metric of its row."""
-    values = {n: m.worst if n in measured else float("nan") for n, m in metrics.items()}
-    frames = len(rollout.target)
-    return ClipResult(
-        **_place(prediction, rollout),
-        values=values,
-        weights={name: float(name in measured) for name in metrics},
-        curves={name: [value] * frames for name, value in values.items()},
-        failed=True,
-    )
-
-
-def _place(prediction: Prediction, rollout: Rollout) -> dict[str, Any]:
-    sample = prediction.sample
-    return {
-        "split": sample.plan.split,
-        "episode": sample.plan.episode,
-        "start": sample.plan.start,
-        "ood_label": sample.episode.ood_label,
-        "kind": prediction.predictor,
-        "frames": len(rollout.target),
-    }
+            with noting(f"in metric {name!r} {clip.where}", metric):
+                curve = np.full(frames, metric.worst) if scored.failed else metric.curve(shown)
+                scored.values[name], scored.weights[name] = metric.scored(shown, curve)
+                scored.curves[name] = curve.astype(np.float32).tolist()
+                if isinstance(metric, SetMetric) and not scored.failed:
+                    features = np.asarray(metric.features(shown))
+                    check_shape(metric, "features", features, 2, -1)
+                    scored.features[name] = features.tolist()
+    return scored
 
 
 def estimator_for(card: EnvironmentCard) -> StateEstimator | None:

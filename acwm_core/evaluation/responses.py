@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,16 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec
-from acwm_core.env.episode import Episode
 from acwm_core.errors import noting
-from acwm_core.evaluation.clip_results import summary_of
-from acwm_core.evaluation.clips import Batch, ClipPlan, Predictor, as_clip
-from acwm_core.evaluation.evaluator import Evaluator, ShownClip
-from acwm_core.evaluation.metric import Metric, Rollout
-from acwm_core.evaluation.results import Counterfactual, ResponseCurve, VideoRecord
+from acwm_core.evaluation.clips import Predictor
+from acwm_core.evaluation.metric import Metric, Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.results import Counterfactual, ResponseCurve
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
-from acwm_core.evaluation.videos import case_study
-from acwm_core.model.shapes import Clip
+from acwm_core.evaluation.summarise import summary_of
+from acwm_core.evaluation.videos import ShownClip, shown
 
 ROWS: tuple[Predictor, ...] = ("model", "codec")
 """The rows that are compared: the model, and the codec's reconstruction of the true responses,
@@ -43,18 +41,12 @@ class Branch:
     size: float = 0.0  # size of a shift, as a fraction of half the dimension's range; else 0
 
 
-@dataclass(frozen=True)
-class Fan:
-    """A clip, simulated again, and its branches with the simulated episode of each."""
-
-    plan: ClipPlan
-    factual: Episode
-    branches: list[Branch]
-    episodes: list[Episode]
+Simulated = tuple[list[Branch], Prediction]
+"""Other actions for a clip, and the clip's true video with theirs as `Prediction.branches`."""
 
 
 def counterfactual(
-    evaluator: Evaluator, metrics: Mapping[str, Metric], fans: Iterator[Fan]
+    evaluator: Evaluator, metrics: Mapping[str, Metric], simulated: Iterable[Simulated]
 ) -> tuple[Counterfactual, list[ShownClip]]:
     """Predict the clips of a split and their branches with the same noise; compare the responses.
 
@@ -62,58 +54,45 @@ def counterfactual(
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
     videos: list[ShownClip] = []
-    for fan in fans:
-        truth = [as_clip(each.video) for each in (fan.factual, *fan.episodes)]
+    for branches, truth in simulated:
         for row in ROWS:
-            with noting(fan.plan.where, *evaluator.world_model.children()):
-                rollout = _rollout(evaluator, fan, truth, row)
-                responses.add(row, fan, rollout)
+            with noting(truth.clip.where, *evaluator.world_model.children()):
+                prediction = _predicted(evaluator, truth, row)
+                responses.add(row, branches, prediction)
             if row == "model" and not videos:
-                videos = _videos(rollout, fan)
+                videos = _videos(prediction, branches)
     return responses.summary(), videos
 
 
-def _rollout(evaluator: Evaluator, fan: Fan, truth: Sequence[Clip], row: Predictor) -> Rollout:
-    asked = [fan.factual.actions, *(branch.actions for branch in fan.branches)]
-    predicted: list[Clip] = []
-    size, device = evaluator.config.batch_size, evaluator.device
-    for first in range(0, len(asked), size):
-        video = torch.stack(list(truth[first : first + size])).to(device)
-        actions = torch.as_tensor(np.stack(asked[first : first + size]), device=device)
-        seeds = [fan.plan.seed] * len(video)
-        batch = Batch(video, actions, actions, seeds, fan.plan.given)
-        predicted += evaluator.predict(batch, [row])[row]
-        evaluator.advance(len(video))
-    made = [
-        Rollout.of(*fan.plan.scored(episode, true, video), evaluator.card)
-        for episode, true, video in zip((fan.factual, *fan.episodes), truth, predicted, strict=True)
-    ]
-    return replace(made[0], estimator=evaluator.estimator, branches=tuple(made[1:]))
+def _predicted(evaluator: Evaluator, truth: Prediction, row: Predictor) -> Prediction:
+    """A clip and its branches as `row` predicts them, from the last context frame on."""
+    truths, made = [truth, *truth.branches], list[Prediction]()
+    size = evaluator.config.batch_size
+    for first in range(0, len(truths), size):
+        batch = truths[first : first + size]
+        made += evaluator.predict(batch, [row])
+        evaluator.advance(len(batch))
+    return replace(made[0], branches=tuple(made[1:])).without(truth.clip.given - 1)
 
 
-def _videos(rollout: Rollout, fan: Fan) -> list[ShownClip]:
-    largest = max((branch.size for branch in fan.branches), default=0.0)
-    shown = [("factual", rollout)] + [
+def _videos(prediction: Prediction, branches: Sequence[Branch]) -> list[ShownClip]:
+    largest = max((branch.size for branch in branches), default=0.0)
+    named = [("factual", prediction)] + [
         (branch.kind, each)
-        for branch, each in zip(fan.branches, rollout.branches, strict=True)
+        for branch, each in zip(branches, prediction.branches, strict=True)
         if branch.size in (0.0, largest)
     ]
-    videos: list[ShownClip] = []
-    for number, (kind, each) in enumerate(shown):
-        panels, frames = case_study(each.target, each.prediction, each.masks)
-        record = VideoRecord(
-            file=f"{fan.plan.split}-{fan.plan.episode:06d}-branch-{number:02d}.mp4",
-            split=fan.plan.split,
-            episode=fan.plan.episode,
-            ood_label=fan.factual.ood_label,
-            pick="counterfactual",
+    clip = prediction.clip
+    return [
+        shown(
+            each,
+            f"{clip.split}-{clip.episode:06d}-branch-{number:02d}.mp4",
             kind=f"branch:{kind}",
-            values={},
-            actions=each.actions.tolist(),
-            panels=panels,
+            pick="counterfactual",
+            actions=each.actions,
         )
-        videos.append((record, frames))
-    return videos
+        for number, (kind, each) in enumerate(named)
+    ]
 
 
 @dataclass(frozen=True)
@@ -128,12 +107,11 @@ class Energies:
     values: int  # pixels times channels
 
     @classmethod
-    def of(cls, factual: Rollout, branch: Branch, made: Rollout) -> Energies:
+    def of(cls, factual: Prediction, branch: Branch, made: Prediction) -> Energies:
         """Compute them for one branch."""
-        actions = branch.actions[-len(factual.actions) :]  # from the last context frame on
-        shift = np.abs(actions - factual.actions)[:-1].mean(0, dtype=np.float64)
+        shift = np.abs(made.actions - factual.actions)[:-1].mean(0, dtype=np.float64)
         true = (made.target.double() - factual.target).flatten(1)
-        predicted = (made.prediction.double() - factual.prediction).flatten(1)
+        predicted = (made.video.double() - factual.video).flatten(1)
         products = true * true, predicted * true, predicted * predicted
         return cls(branch, shift, torch.stack([p.sum(1) for p in products]).numpy(), true.shape[1])
 
@@ -147,19 +125,19 @@ class ActionResponses:
         self._scores: dict[tuple[str, str, str], list[tuple[float, float, int, int]]] = {}
         self._energies: dict[str, list[Energies]] = {}  # by row
 
-    def add(self, row: str, fan: Fan, rollout: Rollout) -> None:
-        """Score one row's responses to the branches of a clip; `rollout` has them in order."""
-        plan = fan.plan
-        self._frames[plan.split, plan.episode] = len(rollout.target)
-        pairs = list(zip(fan.branches, rollout.branches, strict=True))
-        for kind in (ALL, *dict.fromkeys(branch.kind for branch in fan.branches)):
+    def add(self, row: str, branches: Sequence[Branch], prediction: Prediction) -> None:
+        """Score one row's responses to the branches of a clip; `prediction` has them in order."""
+        clip = prediction.clip
+        self._frames[clip.split, clip.episode] = len(prediction.target)
+        pairs = list(zip(branches, prediction.branches, strict=True))
+        for kind in (ALL, *dict.fromkeys(branch.kind for branch in branches)):
             among = tuple(made for branch, made in pairs if kind in (ALL, branch.kind))
-            part = replace(rollout, branches=among)
+            part = replace(prediction, branches=among)
             for name, metric in self.metrics.items():
                 with torch.autocast("cpu", enabled=False):
-                    scored = *metric.scored(part), plan.episode, 0
+                    scored = *metric.scored(part), clip.episode, 0
                 self._scores.setdefault((row, kind, name), []).append(scored)
-        made = [Energies.of(rollout, *pair) for pair in pairs]
+        made = [Energies.of(prediction, *pair) for pair in pairs]
         self._energies.setdefault(row, []).extend(made)
 
     def summary(self) -> Counterfactual:

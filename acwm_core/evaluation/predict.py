@@ -1,0 +1,220 @@
+"""`Evaluator`: predicts clips batch by batch, scores them, and makes videos of a few."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.physics import StateEstimator
+from acwm_core.errors import noting
+from acwm_core.evaluation.clips import (
+    PREDICTORS,
+    Clip,
+    Predictor,
+    as_clip,
+    donor_actions,
+    read_clips,
+)
+from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.metric import Metric, Prediction
+from acwm_core.evaluation.results import Score
+from acwm_core.evaluation.score import (
+    headline_of,
+    needs_estimator,
+    predictors_for,
+    quick_metrics,
+    score,
+)
+from acwm_core.evaluation.videos import ShownClip, pick_clips, shown
+from acwm_core.model.denoiser import Denoiser
+from acwm_core.model.shapes import Video
+from acwm_core.model.world_model import WorldModel
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """Everything needed to predict and score clips.
+
+    Attributes:
+        world_model: in evaluation mode, on the device where it will run.
+        card: the environment's card, for the metrics.
+        metrics: the metrics by name.
+        config: the settings.
+        estimator: reads states from video for the metrics; None if there is none.
+        left_out: metrics that cannot be measured here, and why.
+        advance: progress callback, called with the number of newly scored predictions.
+    """
+
+    world_model: WorldModel
+    card: EnvironmentCard
+    metrics: Mapping[str, Metric]
+    config: EvaluationConfig
+    estimator: StateEstimator | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    advance: Callable[[int], None] = lambda count: None
+
+    @property
+    def headline(self) -> str:
+        """The metric that ranks clips and heads the report."""
+        return headline_of(self.metrics)
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The rows that `scores` predicts; ``truth`` only if a metric reads states from video."""
+        reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
+        return tuple(each for each in PREDICTORS if reads or each != "truth")
+
+    @property
+    def given(self) -> int:
+        """How many context frames of a clip the model is given."""
+        return self.config.context_frames or self.world_model.context_frames
+
+    @property
+    def steps_sweep(self) -> tuple[int, ...]:
+        """Numbers of sampling steps to compare; empty for a model without sampling steps."""
+        has_choice = isinstance(self.world_model.model, Denoiser)
+        return self.config.steps_sweep if has_choice else ()
+
+    @property
+    def device(self) -> torch.device:
+        """The device on which the model runs."""
+        return self.world_model.action_low.device
+
+    def truths(self, clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[Prediction]:
+        """The true video of each clip, as a prediction of itself."""
+        for clip, episode in read_clips(clips, episodes):
+            video = as_clip(episode.video)
+            truth = Prediction.of(episode, video, video, self.card, self.estimator)
+            yield replace(truth, clip=clip, kind="truth")
+
+    def predict(
+        self,
+        truths: Sequence[Prediction],
+        kinds: Sequence[Predictor],
+        donated: Sequence[NDArray[np.float32]] = (),
+    ) -> list[Prediction]:
+        """Predict clips of one length, in one batch; all `kinds` of the first clip come first.
+
+        Args:
+            truths: the true clips; the model is given their context frames and actions.
+            kinds: what predicts them, of `PREDICTORS`.
+            donated: another episode's actions for each clip, for ``shuffled``.
+        """
+        given, seeds = truths[0].clip.given, [truth.clip.seed for truth in truths]
+        true = torch.stack([truth.target for truth in truths]).to(self.device)
+
+        def rollout(actions: Sequence[NDArray[np.float32]]) -> Video:
+            chunks = self.world_model.rollout_chunks(
+                true[:, :given],
+                torch.as_tensor(np.stack(actions), device=self.device),
+                mode=self.config.mode,
+                steps=self.config.steps,
+                seeds=seeds,
+            )
+            return torch.cat([*chunks], 1)
+
+        makers: dict[Predictor, Callable[[], Video]] = {
+            "model": lambda: rollout([truth.actions for truth in truths]),
+            "shuffled": lambda: rollout(donated),
+            "copy": lambda: true[:, given - 1, None].expand_as(true),
+            "codec": lambda: self.world_model.codec(true),
+            "truth": lambda: true,
+        }
+        with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
+            videos = {kind: makers[kind]().float().cpu() for kind in kinds}
+        return [
+            replace(truth, video=videos[kind][place], kind=kind)
+            for place, truth in enumerate(truths)
+            for kind in predictors_for(truth.clip, kinds)
+        ]
+
+    def predictions(
+        self, clips: Iterable[Clip], episodes: EpisodeDataset, kinds: Sequence[Predictor]
+    ) -> Iterator[list[Prediction]]:
+        """Predict clips batch by batch: successive clips of equal length together."""
+        size = self.config.batch_size
+        for _, alike in itertools.groupby(
+            self.truths(clips, episodes), lambda truth: len(truth.target)
+        ):
+            while truths := list(itertools.islice(alike, size)):
+                first, last = truths[0].clip, truths[-1].clip
+                until = f" to episode {last.episode}, from frame {last.start}"
+                donated = (
+                    [donor_actions(truth.clip, truth.actions, episodes) for truth in truths]
+                    if "shuffled" in kinds
+                    else []
+                )
+                with noting(first.where + until * (last != first), *self.world_model.children()):
+                    made = self.predict(truths, kinds, donated)
+                yield made
+
+    def scores(
+        self,
+        clips: Sequence[Clip],
+        episodes: EpisodeDataset,
+        kinds: Sequence[Predictor] | None = None,
+    ) -> list[Score]:
+        """Score all rows, or only those of `kinds`, of all clips of a split, clip by clip."""
+        scores: list[Score] = []
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # NumPy releases the GIL
+            for made in self.predictions(clips, episodes, kinds or self.predictors):
+                scores += pool.map(score, made, itertools.repeat(self.metrics))
+                self.advance(len(made))
+        return scores
+
+    def sweep(self, clips: Sequence[Clip], episodes: EpisodeDataset) -> dict[int, list[Score]]:
+        """Score the model on the first clip of each of the first episodes, per `steps_sweep` entry.
+
+        Metrics that read states from video are left out (unless one is the headline), since reading
+        them would take longer than predicting the clips.
+        """
+        quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
+        settings = {steps: replace(self.config, steps=steps) for steps in self.steps_sweep}
+        return {
+            steps: replace(quick, config=config).scores(self._swept(clips), episodes, ["model"])
+            for steps, config in settings.items()
+        }
+
+    def count_rows(self, clips: Sequence[Clip], kinds: Sequence[Predictor] | None = None) -> int:
+        """How many rows `scores` makes of a split, and of `sweep` if no `kinds` are given."""
+        rows = sum(len(predictors_for(clip, kinds or self.predictors)) for clip in clips)
+        return rows + (len(self.steps_sweep) * len(self._swept(clips)) if kinds is None else 0)
+
+    def videos(
+        self, clips: Sequence[Clip], episodes: EpisodeDataset, scores: Sequence[Score]
+    ) -> list[ShownClip]:
+        """Videos of the best, median and worst clips, and the median ones with other actions too.
+
+        Predicts these clips again with the same noise, so that `scores` need not keep all videos.
+        """
+        by_place = {(clip.episode, clip.start): clip for clip in clips}
+        values = {(s.episode, s.start, s.kind): s.values for s in scores}
+        videos: list[ShownClip] = []
+        higher = self.metrics[self.headline].higher_is_better
+        for place, pick in pick_clips(scores, self.headline, higher, self.config.videos).items():
+            clip = by_place[place]
+            kinds: list[Predictor] = ["model", "shuffled"] if pick == "median" else ["model"]
+            (made,) = self.predictions([clip], episodes, kinds)
+            for each in made:
+                actions = each.actions
+                if each.kind == "shuffled":
+                    actions = donor_actions(clip, actions, episodes)
+                start = f"-{clip.start:04d}" if clip.start else ""
+                file = f"{clip.split}-{clip.episode:06d}{start}-{each.kind}.mp4"
+                own = values[*place, each.kind]
+                videos.append(
+                    shown(each, file, kind=each.kind, pick=pick, actions=actions, values=own)
+                )
+        return videos
+
+    def _swept(self, clips: Sequence[Clip]) -> list[Clip]:
+        first = {clip.episode: clip for clip in reversed(clips)}
+        return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]

@@ -1,0 +1,106 @@
+"""A cache of the reference rows: they are the same for all models with the same codec."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import json
+from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+import acwm_core
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.manifest import file_sha256
+from acwm_core.errors import DataError
+from acwm_core.evaluation.clips import Clip, Predictor
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.results import Score
+from acwm_core.evaluation.score import measure_facts
+from acwm_core.evaluation.storage import load_scores, write_scores
+
+REFERENCES = "references"
+
+KEPT: tuple[Predictor, ...] = ("copy", "codec", "truth")
+"""The rows that do not depend on the model."""
+
+
+def scores_with_references(
+    evaluator: Evaluator, clips: Sequence[Clip], episodes: EpisodeDataset
+) -> list[Score]:
+    """What `Evaluator.scores` returns, with the rows of `KEPT` read from the cache.
+
+    If they are not cached yet, they are computed and cached for the next evaluation, provided that
+    the data folder is writable.
+    """
+    file = references_file(evaluator, clips, episodes)
+    found: list[Score] = []
+    with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
+        found = load_scores(file) if file else []
+    kinds: list[Predictor] = [k for k in evaluator.predictors if not found or k not in KEPT]
+    made = evaluator.scores(clips, episodes, kinds)
+    evaluator.advance(len(found))
+    if file and not found:
+        with contextlib.suppress(OSError, DataError):  # e.g. a read-only dataset
+            file.parent.mkdir(exist_ok=True)
+            write_scores(file, [score for score in made if score.kind in KEPT])
+    rows = {(row.episode, row.start, row.kind): row for row in [*found, *made]}
+    places = [(c.episode, c.start, kind) for c in clips for kind in evaluator.predictors]
+    return [rows[place] for place in places if place in rows]
+
+
+def references_file(
+    evaluator: Evaluator, clips: Sequence[Clip], episodes: EpisodeDataset
+) -> Path | None:
+    """The cache file for the rows of these clips; None if the code behind them cannot be hashed.
+
+    Its name contains a hash of everything they depend on, so it is never out of date. The folder
+    may be deleted.
+    """
+    codec, estimator = evaluator.world_model.codec, evaluator.estimator
+    components = [codec, *evaluator.metrics.values()]
+    packages = {type(each).__module__.partition(".")[0] for each in components}
+    packages |= {acwm_core.__name__, *(estimator.packages() if estimator else ())}
+    hashes = {name: package_hash(name) for name in sorted(packages)}
+    if None in hashes.values():
+        return None
+    facts: dict[str, Any] = {
+        "data": episodes.checksum,
+        "clips": [(c.episode, c.start, c.frames, c.noise_floor, c.given) for c in clips],
+        "codec": codec.fingerprint(),
+        "device": evaluator.device.type,
+        "metrics": list(evaluator.metrics),
+        "measures": measure_facts(evaluator.metrics, estimator),
+        "options": [evaluator.config.metrics, evaluator.config.metric_options],
+        "code": hashes,
+        "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
+    }
+    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    return episodes.path / REFERENCES / f"{episodes.split}-{key[:16]}.parquet"
+
+
+@cache
+def package_hash(name: str) -> str | None:
+    """The hash of all files of a top-level package or module; None if it has no files.
+
+    All files count, since a metric may depend on any: its code, weights, or a table of thresholds.
+    """
+    try:
+        spec = importlib.util.find_spec(name) if name != "__main__" else None
+    except ValueError:  # for a module that was created in memory
+        spec = None
+    if spec is None or not spec.origin:
+        return None
+    origin = Path(spec.origin)
+    files = [origin]
+    if spec.submodule_search_locations:
+        files = sorted(
+            f for f in origin.parent.rglob("*") if f.is_file() and "__pycache__" not in f.parts
+        )
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.relative_to(origin.parent)}\0{file_sha256(file)}".encode())
+    return digest.hexdigest()
