@@ -9,7 +9,7 @@ Runs `acwm evaluate` on a small model, from a run or untrained, in one thread, s
 meaningful even on a busy machine. The time of sampling does not depend on the weights, but that of
 metrics may: a rope is only traced if it is visible. The data is generated once and kept. The model
 is evaluated twice: first as the first model on its data, then as a later one, which reuses the rows
-that are the same for every model (`acwm_core.evaluation.provenance`). The cost of these rows is
+that are the same for every model (`acwm_core.evaluation.references`). The cost of these rows is
 counted separately, as it is spent once per dataset.
 """
 
@@ -33,7 +33,7 @@ from acwm_core.cli.arguments import size
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.evaluation import evaluate, evaluator
+from acwm_core.evaluation import evaluate, predict
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.references import KEPT, REFERENCES
@@ -92,7 +92,7 @@ class Clock:
 
 def instrument(clock: Clock, build_metrics: Callable[..., dict[str, Metric]]) -> Any:
     """Count the time of everything that an evaluation calls; returns the new `build_metrics`."""
-    clock.mark(evaluator, "score", lambda made, *_: REFERENCE if made.kind in KEPT else "")
+    clock.mark(predict, "score", lambda made, *_: REFERENCE if made.kind in KEPT else "")
     clock.wrap(WorldModel, "rollout", SAMPLING)
     clock.wrap(Codec, "forward", CODEC)
     clock.wrap(EpisodeDataset, "__getitem__", READING)

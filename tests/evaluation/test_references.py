@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.evaluation import provenance
+from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.evaluation import references
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
 from acwm_core.evaluation.references import KEPT, package_hash, references_file
@@ -38,13 +38,13 @@ def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monke
     assert [name.rpartition("-")[0] for name in kept] == ["ind_test", "ood_test"]
 
     scored = []
-    score = provenance.Evaluator.scores
+    score = references.Evaluator.scores
 
     def watched(self, plans, episodes, predictors=None):
         scored.append(predictors)
         return score(self, plans, episodes, predictors)
 
-    monkeypatch.setattr(provenance.Evaluator, "scores", watched)
+    monkeypatch.setattr(references.Evaluator, "scores", watched)
     evaluate_run(run, progress=False)
     assert scored
     assert not {each for predictors in scored for each in predictors} & {*KEPT}
@@ -95,10 +95,10 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     monkeypatch.setattr(type(evaluator.world_model.codec), "fingerprint", lambda self: "other")
     others.append(name())
     monkeypatch.undo()
-    monkeypatch.setattr(provenance, "package_hash", lambda name: "other code")
+    monkeypatch.setattr(references, "package_hash", lambda name: "other code")
     others.append(name())
     monkeypatch.undo()
-    monkeypatch.setattr(provenance, "distributions", lambda: [])
+    monkeypatch.setattr(references, "distributions", lambda: [])
     others.append(name())
     monkeypatch.undo()
     assert name() == name()
