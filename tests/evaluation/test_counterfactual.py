@@ -59,6 +59,9 @@ class Known:
             videos.append(self.predict(usual, true, seed))
         yield torch.stack(videos)
 
+    def children(self):
+        return []
+
     def codec(self, video):
         return video * 0.5 + 0.25
 

@@ -200,8 +200,8 @@ def test_the_true_frame_standing_still_breaks_no_law():
     seen = clip(AMOUNT, states={"level": np.ones(FRAMES)}, read=read)
     assert AmountError().value(seen) == pytest.approx(0.3)
     assert Violations().value(seen) == 1
-    still = replace(seen, video=torch.zeros_like(seen.prediction))
+    still = replace(seen, video=torch.zeros_like(seen.video))
     assert Violations().value(still) == 0
     assert Violations().per_frame(still).tolist() == [0] * FRAMES
-    other = replace(seen, video=torch.ones_like(seen.prediction))
+    other = replace(seen, video=torch.ones_like(seen.video))
     assert Violations().value(other) == 1  # only the given frame is beyond doubt

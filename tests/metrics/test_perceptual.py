@@ -80,7 +80,7 @@ def by_parts(network, clip):
     """LPIPS with the scaling and the heads of torchmetrics, in double precision."""
     _, layers, compared, heads, _ = network
     outputs = []
-    for video in (clip.prediction, clip.target):
+    for video in (clip.video, clip.target):
         hidden, found = ScalingLayer()(video * 2 - 1), []
         for place, layer in enumerate(layers):
             hidden = layer(hidden)
@@ -124,7 +124,7 @@ def test_lpips_is_that_of_torchmetrics_with_its_heads(name, tmp_path, monkeypatc
     clip = clips()
     network = theirs._NoTrainLpips(net=name, pretrained=True)
     with torch.no_grad():
-        expected = network(clip.prediction, clip.target, normalize=True).flatten().double().numpy()
+        expected = network(clip.video, clip.target, normalize=True).flatten().double().numpy()
     metric = LPIPS(network=name, backbone=str(tmp_path / "backbone.pth"))
     assert (expected > 0).all()
     np.testing.assert_allclose(metric.per_frame(clip), expected, rtol=1e-3)

@@ -99,7 +99,7 @@ def test_psnr_agrees_with_scikit_image_but_for_the_error_floor(noisy):
         exact = peak_signal_noise_ratio(true.numpy(), seen.numpy(), data_range=1)
         return -10 * math.log10(10 ** (-exact / 10) + 1e-8)
 
-    target, prediction = noisy.target.double(), noisy.prediction.double()
+    target, prediction = noisy.target.double(), noisy.video.double()
     frames = [floored(*pair) for pair in zip(target, prediction, strict=True)]
     np.testing.assert_allclose(PSNR().per_frame(noisy), frames, rtol=1e-7)
     assert PSNR().value(noisy) == pytest.approx(floored(target, prediction), rel=1e-7)

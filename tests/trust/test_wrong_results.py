@@ -9,7 +9,7 @@ import torch
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import PluginError
-from acwm_core.evaluation.metric import Metric, Rollout
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_planning.controllers import check_bounds
 from tests.core.tiny import SumConditioner
 from tests.evaluation import tiny
@@ -73,10 +73,10 @@ def test_conditioners(cut, told):
         made.condition(torch.zeros(1, 9, 2), 5, 4)
 
 
-def rollout():
+def prediction():
     episode = simulate(make_environment("drift"), EpisodeSpec("drift"))
     video = torch.from_numpy(episode.video).permute(0, 3, 1, 2) / 255
-    return Rollout.of(episode, video, video, Drift.card)
+    return Prediction.of(episode, video, video, Drift.card)
 
 
 @pytest.mark.parametrize(
@@ -91,25 +91,25 @@ def test_metrics(scores, told):
     class Given(Metric):
         name = "given"
 
-        def per_frame(self, rollout):
+        def per_frame(self, prediction):
             return scores
 
     with pytest.raises(PluginError, match=told):
-        Given().curve(rollout())
+        Given().curve(prediction())
 
 
 def test_a_weight_counts_no_clip_negatively():
     class Negative(Metric):
         name = "negative"
 
-        def per_frame(self, rollout):
-            return np.zeros(len(rollout.target))
+        def per_frame(self, prediction):
+            return np.zeros(len(prediction.target))
 
-        def weight(self, rollout):
+        def weight(self, prediction):
             return -1.0
 
     with pytest.raises(PluginError, match="weight gives -1"):
-        Negative().scored(rollout())
+        Negative().scored(prediction())
 
 
 def test_actions_of_policies_at_the_door():
