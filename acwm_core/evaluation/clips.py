@@ -17,7 +17,7 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.protocol import protocol_named
 
 if TYPE_CHECKING:
-    from acwm_core.data.episodes import EpisodeDataset
+    from acwm_core.data.dataset import EpisodeDataset
     from acwm_core.model import shapes
 
 Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]

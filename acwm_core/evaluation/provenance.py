@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 import acwm_core
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.shards import file_sha256
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.score import measure_facts
 from acwm_core.recipe import Recipe

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import acwm_core
-from acwm_core.data.episodes import EpisodeDataset
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import Clip, Predictor
 from acwm_core.evaluation.predict import Evaluator

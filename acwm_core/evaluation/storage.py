@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from acwm_core.data.atomic import written_whole
-from acwm_core.data.manifest import file_sha256
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from acwm_core.data.episodes import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation import references
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
