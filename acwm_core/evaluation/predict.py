@@ -34,7 +34,6 @@ from acwm_core.evaluation.score import (
     score,
 )
 from acwm_core.evaluation.videos import ShownClip, pick_clips, shown
-from acwm_core.model.denoiser import Denoiser
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
 
@@ -80,8 +79,7 @@ class Evaluator:
     @property
     def steps_sweep(self) -> tuple[int, ...]:
         """Numbers of sampling steps to compare; empty for a model without sampling steps."""
-        has_choice = isinstance(self.world_model.model, Denoiser)
-        return self.config.steps_sweep if has_choice else ()
+        return self.config.steps_sweep if self.world_model.objective.steps else ()
 
     @property
     def device(self) -> torch.device:
