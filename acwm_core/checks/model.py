@@ -11,6 +11,7 @@ from torch import Tensor
 
 from acwm_core.checks.result import (
     CheckResult,
+    NotTried,
     Suite,
     expect,
     expect_equal,
@@ -193,21 +194,25 @@ class DynamicsChecks(Suite):
 
     def later_actions_change_nothing_if_causal(self) -> None:
         """With `causal` true, predict a frame independently of the actions after it."""
+        if not self._model.causal:
+            raise NotTried("it is not causal")
         latents, modulation = self._inputs()
         other = modulation.clone()
         other[:, -1] += 1
         usual, changed = (self._predict(latents[:, :1], m) for m in (modulation, other))
         error = batch_error(usual[:, :-1], changed[:, :-1])
-        what = f"earlier frames change by {error:.2g} with the last action"
-        expect(error < 1e-4 or not self._model.causal, what)
+        expect(error < 1e-4, f"earlier frames change by {error:.2g} with the last action")
 
     def lets_the_conditioner_act_at_the_input(self) -> None:
         """With layers, call `inject_input` before the first, and go on with what it returns."""
-        if self._model.layers:
-            self._expect_heeded("input", self._model.width, "inject_input")
+        if not self._model.layers:
+            raise NotTried("it has no layers")
+        self._expect_heeded("input", self._model.width, "inject_input")
 
     def lets_the_conditioner_act_after_every_layer(self) -> None:
         """Call `inject` after each layer, with its width, and go on with what it returns."""
+        if not self._model.layers:
+            raise NotTried("it has no layers")
         for layer, width in enumerate(self._model.widths):
             self._expect_heeded(layer, width, f"inject for layer {layer}")
 
@@ -227,14 +232,16 @@ class DynamicsChecks(Suite):
         latents, modulation = self._inputs()
         frames, conditioning = SHAPE[1], self._conditioning(modulation)
         objective, model = self._objective, self._model
-        for known in (1, 2) if not (isinstance(model, Denoiser) and model.inputs) else ():
+        if isinstance(model, Denoiser) and model.inputs:
+            raise NotTried("its further inputs come from an objective")
+        for known in (1, 2):
             given = latents[:, :known]
             try:
                 stream = objective.stream(model, given, draws(len(given)), context=frames)
-            except RecipeError:
+            except RecipeError as error:
                 what = "it refuses to stream as it was trained"
                 expect(not objective.streams_by_default(model), what)
-                return
+                raise NotTried(str(error)) from None
             expect(model.causal, "it streams, but does not say that it is causal")
             streamed = played(stream, conditioning, known, frames)
             predicted = self._predict(given, modulation)[:, known:]
@@ -365,7 +372,10 @@ class DenoiserChecks(Suite):
         """Let the prediction of a frame depend on each of its `inputs`."""
         latents, sigma, conditioning = self._inputs()
         usual = self._run(latents, sigma, conditioning)
-        for name, given in further_inputs(self._model, *latents.shape).items():
+        inputs = further_inputs(self._model, *latents.shape)
+        if not inputs:
+            raise NotTried("it has none")
+        for name, given in inputs.items():
             changed = self._run(latents, sigma, conditioning, **{name: 1 - given})
             for frame in range(latents.shape[1]):
                 same = torch.equal(usual[:, frame], changed[:, frame])
@@ -373,9 +383,11 @@ class DenoiserChecks(Suite):
 
     def is_causal_if_it_says_so(self) -> None:
         """With `causal` true, predict a frame independently of later ones."""
+        if not self._model.causal:
+            raise NotTried("it is not causal")
         latents, sigma, conditioning = self._inputs(frames=4)
         usual = self._run(latents, sigma, conditioning)
-        for frame in range(1, latents.shape[1]) if self._model.causal else ():
+        for frame in range(1, latents.shape[1]):
             changed = self._run(*_changed(latents, sigma, frame), conditioning)
             error = batch_error(usual[:, :frame], changed[:, :frame])
             what = f"what it predicts before latent frame {frame} depends on that frame"
@@ -385,12 +397,12 @@ class DenoiserChecks(Suite):
         """With a cache, predict the same as for all frames at once, in and beyond the context."""
         model, inputs = self._model, self._inputs(batch=2, frames=6)
         if type(model).new_cache is Denoiser.new_cache:
-            return
+            raise NotTried("it has no cache")
         try:
             model.new_cache(2)
-        except RecipeError:
+        except RecipeError as error:
             expect(not model.causal, "it is causal and has a cache, but refuses to make one")
-            return
+            raise NotTried(str(error)) from None
         beyond = self._extend(model.new_cache(3), inputs, 0, 6)
         negative = (-inputs[0], *inputs[1:])
         for context, expected in ((6, self._run(*inputs)), (3, beyond)):
