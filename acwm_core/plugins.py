@@ -99,6 +99,9 @@ REMOVED_HOOKS = {
     "register_checks": "give the suite to the kind: `registry.add(…, check='module:suite')` in "
     "`register_kinds`",
     "register_completions": "give a parameter of your command a `shell_complete`",
+    "register_dataset_exporters": "see `register_dataset_importers`",
+    "register_dataset_importers": "make importer and exporter one `acwm_formats.format.Format` "
+    "with `detect`, `read` and `write`, and add it in `register_formats`",
     "register_gymnasium_environments": "call `gymnasium.register`",
     "register_tables": "return the tables from `Protocol.tables`, and register the protocol",
 }

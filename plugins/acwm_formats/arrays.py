@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.recordings import (
+from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.episode import SPLITS, Split
+from acwm_core.errors import DataError, suggest
+from acwm_formats.recordings import (
     RecordedDataset,
     Recording,
     Recordings,
     import_dataset,
     recorded_card,
 )
-from acwm_core.env.environment import ActionSpec, StateField
-from acwm_core.env.episode import SPLITS, Split
-from acwm_core.errors import DataError, suggest
 from acwm_formats.video import shrunk, target_size
 
 __all__ = ["Recording", "write_dataset"]

@@ -1,4 +1,4 @@
-"""Checks of dataset importers and exporters: what `acwm data` requires of them."""
+"""Checks of formats: what `acwm data import` and `acwm data export` require of them."""
 
 from __future__ import annotations
 
@@ -15,86 +15,105 @@ import numpy as np
 from acwm_core.checks.result import NotTried, Suite, expect, expect_is_a
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.formats import DatasetExporter, DatasetImporter, export_dataset, options_of
-from acwm_core.data.recordings import RecordedDataset, Recording, import_dataset, recorded_card
 from acwm_core.env.environment import ActionSpec
-from acwm_core.plugins import catalog
 from acwm_formats.check import check_dataset
+from acwm_formats.format import Format, export_dataset, options_of
+from acwm_formats.recordings import RecordedDataset, Recording, import_dataset, recorded_card
 
 MIN_PSNR = 25.0  # in dB; lossy video of smooth frames has more
 TAKEN = {"out", "workers", "data"}  # options that the commands define themselves
 
 
 class FormatChecks(Suite):
-    """Checks of every format, in an empty folder."""
+    """Checks of an `acwm_formats.format.Format`: of what it reads, on its own example, and writes.
+
+    What it writes are episodes of moving waves.
+    """
+
+    kind = "format"
 
     @functools.cached_property
     def _folder(self) -> Path:
         self._kept = tempfile.TemporaryDirectory()  # until the checks are done
         return Path(self._kept.name)
 
-    def documents_its_options(self) -> None:
-        """Give every parameter a type and a description in the docstring."""
-        for parameter, text in options_of(self.target):
-            name = parameter.name
-            expect(parameter.annotation is not inspect.Parameter.empty, f"{name} has no type")
-            expect(text, f"Args of the docstring do not say what {name} is")
-            expect(name not in TAKEN, f"{name} is an option of every format: call it otherwise")
-
-
-class DatasetImporterChecks(FormatChecks):
-    """Checks of an `acwm_core.data.formats.DatasetImporter` on its own example."""
-
-    kind = "dataset_importer"
-
-    def imports_its_example(self) -> None:
-        """Import the example as valid datasets, which are the same at a second import."""
+    @functools.cached_property
+    def _example(self) -> dict[str, Any]:
+        """The parameters to read the example, which is in an own folder."""
         (place := self._folder / "example").mkdir()
-        parameters = self.target.example(place)
-        expect_is_a(self.make(**parameters), DatasetImporter)
-        for at, recorded in _datasets(self.make(**parameters)).items():
-            card = _imported(recorded, self._folder / "one" / at)
-            found = check_dataset(self._folder / "one" / at)
-            problems = [str(each) for each in found if each.problem]
-            expect(not problems, "; ".join(problems))
-            expect("train" in card.splits, "nothing is there to train on")
-            again = _datasets(self.make(**parameters))[at]
-            same = _imported(again, self._folder / "two" / at) == card
-            expect(same, "a second import differs")
-            _read_backwards(recorded)
+        return self.target.example(place)
 
-
-class DatasetExporterChecks(FormatChecks):
-    """Checks of an `acwm_core.data.formats.DatasetExporter` on episodes of moving waves."""
-
-    kind = "dataset_exporter"
-
-    def writes_the_same_bytes_again(self) -> None:
-        """Write files, which are the same at a second call."""
+    @functools.cached_property
+    def _exported(self) -> Path:
+        """The folder of waves as it writes them; those that it should be are beside it."""
         action = ActionSpec(("x", "y"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "delta")
         card = recorded_card("waves", action, frame_size=(32, 48), fps=10, horizon=8)
         splits: Any = {"train": [_waves(0), _waves(1)], "ind_test": [_waves(2)]}
         facts = {"kind": "example", "name": "waves"}
-        _imported(RecordedDataset(card, splits, facts), self._folder / "data")
-        expect_is_a(self.make(), DatasetExporter)
+        _imported(RecordedDataset(card, splits, facts), self._folder / "waves")
+        return self._export("one")
+
+    def _export(self, name: str) -> Path:
+        out = self._folder / name
+        return export_dataset(self._folder / "waves", out, self.make(), progress=False)
+
+    def documents_its_options(self) -> None:
+        """Read or write, and give every parameter a type and a description in the docstring."""
+        expect(issubclass(self.target, Format), "it is no Format")
+        expect(self.target.reads() or self.target.writes(), "it neither reads nor writes")
+        for method in (self.target.read, self.target.write):
+            if method in (Format.read, Format.write):
+                continue
+            for parameter, text in options_of(method):
+                name = parameter.name
+                expect(parameter.annotation is not inspect.Parameter.empty, f"{name} has no type")
+                expect(text, f"Args of the docstring do not say what {name} is")
+                expect(name not in TAKEN, f"{name} is an option of every format: call it otherwise")
+
+    def detects_its_example(self) -> None:
+        """Know its own example, if that is a path, and no folder that is empty."""
+        (empty := self._folder / "empty").mkdir()
+        expect(not self.target.detect(empty), "an empty folder is said to be in this format")
+        (path, *_) = [*self._example.values(), None]
+        if self.target.reads() and isinstance(path, Path):
+            expect(self.target.detect(path), "it does not know its own example")
+
+    def imports_its_example(self) -> None:
+        """Import the example as valid datasets, which are the same at a second import."""
+        if not self.target.reads():
+            raise NotTried("it is only written")
+        for at, recorded in _datasets(self.make().read(**self._example)).items():
+            card = _imported(recorded, self._folder / "first" / at)
+            found = check_dataset(self._folder / "first" / at)
+            problems = [str(each) for each in found if each.problem]
+            expect(not problems, "; ".join(problems))
+            expect("train" in card.splits, "nothing is there to train on")
+            again = _datasets(self.make().read(**self._example))[at]
+            same = _imported(again, self._folder / "second" / at) == card
+            expect(same, "a second import differs")
+            _read_backwards(recorded)
+
+    def writes_the_same_bytes_again(self) -> None:
+        """Write files, which are the same at a second call."""
+        if not self.target.writes():
+            raise NotTried("it is only read")
         files: list[dict[Path, bytes]] = []
-        for out in (self._folder / "one", self._folder / "two"):
-            export_dataset(self._folder / "data", out, self.make(), progress=False)
+        for out in (self._exported, self._export("two")):
             found = [path for path in sorted(out.rglob("*")) if path.is_file()]
             files.append({path.relative_to(out): path.read_bytes() for path in found})
         expect(any(files[0].values()), "nothing is written")
         expect(files[0] == files[1], "a second export differs")
 
     def reads_back(self) -> None:
-        """Write files that the importer of the same name, if any, reads as the same episodes."""
-        importers = {each.name: each for each in catalog().registry("dataset_importer")}
-        if self.name not in importers:
-            raise NotTried("no importer has its name")
-        found = _datasets(importers[self.name].load()(self._folder / "one"))
+        """Read the same episodes from what it wrote, if it does both."""
+        if not (self.target.reads() and self.target.writes()):
+            raise NotTried("it is not both read and written")
+        expect(self.target.detect(self._exported), "it does not know what it wrote")
+        found = _datasets(self.make().read(self._exported))
         expect(len(found) == 1, f"it reads {len(found)} datasets")
         back = _imported(next(iter(found.values())), self._folder / "back")
         for split in back.splits:
-            before, after = (EpisodeDataset(self._folder / f, split) for f in ("data", "back"))
+            before, after = (EpisodeDataset(self._folder / f, split) for f in ("waves", "back"))
             expect(before.lengths == after.lengths, f"{split} comes back with {after.lengths}")
             for one, other in zip(before, after, strict=True):
                 expect(np.allclose(one.actions, other.actions, atol=1e-5), "actions change")
@@ -127,15 +146,11 @@ def _waves(seed: int) -> Recording:
     return Recording(video, np.random.default_rng(seed).uniform(-1, 1, (5 + seed, 2)))
 
 
-def _datasets(importer: DatasetImporter) -> Mapping[str, RecordedDataset]:
-    found: Any = importer.read()
+def _datasets(found: Any) -> Mapping[str, RecordedDataset]:
     if isinstance(found, Mapping):
         return cast(Mapping[str, RecordedDataset], found)
     expect_is_a(found, RecordedDataset)
     return {".": found}
 
 
-check_dataset_exporter = DatasetExporterChecks.check
-
-
-check_dataset_importer = DatasetImporterChecks.check
+check_format = FormatChecks.check

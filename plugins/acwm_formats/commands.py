@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, Union, cast, get_args, get_origin
 
 import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
-from acwm_core.plugins import Component, Registry
+from acwm_core.errors import DataError, UnknownNameError
 from acwm_core.untrusted import printable
+
+if TYPE_CHECKING:
+    from acwm_core.plugins import Registry
+    from acwm_formats.format import Format
 
 
 @click.group()
@@ -99,54 +102,88 @@ def _print_facts(facts: dict[str, Any]) -> None:
 
 
 class FormatGroup(click.Group):
-    """Has one command per registered format, with the options of its class and those of `base`.
+    """Has one command per registered format, with the options of its method and those of `base`.
+
+    The format may also be given by ``--format``, after what is imported or exported.
 
     Args:
-        kind: kind of the registered components.
-        base: called with the component, a dict of its parameters, and the options of `base`.
+        method: `read` or `write`.
+        base: called with the format, a dict of the method's parameters, and the options of `base`.
     """
 
-    def __init__(self, kind: str, base: click.Command) -> None:
-        super().__init__(base.name, help=base.help)
-        self._kind = kind
-        self._base = base
+    def __init__(self, method: str, base: click.Command) -> None:
+        super().__init__(base.name, help=base.help, subcommand_metavar="[FORMAT] PATH [OPTIONS]")
+        self._method, self._base = method, base
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The names of the formats."""
-        return [component.name for component in self._registry()]
+        return [component.name for component in _formats()]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the formats without importing them."""
         with formatter.section("Formats"):
-            formatter.write_dl([(each.name, each.summary) for each in self._registry()])
+            formatter.write_dl([(each.name, each.summary) for each in _formats()])
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the format first: the one of ``--format``, or the one that the path is in."""
+        name, rest = _chosen_format(args)
+        if name is None and rest and not rest[0].startswith("-") and rest[0] not in _formats():
+            name = self._found(rest[0])
+        return super().parse_args(ctx, [name, *rest] if name else rest)
+
+    def _found(self, path: str) -> str:
+        from acwm_formats.format import detected_format
+
+        if self._method == "write":
+            known = ", ".join(self.list_commands(click.Context(self)))
+            raise UnknownNameError("format", path, _formats().components(), f"(one of {known})")
+        if not Path(path).exists():
+            return path  # it is meant as a name: `get_command` suggests the closest
+        name = detected_format(Path(path))
+        click.echo(f"{path} is in the format {name}")
+        return name
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         """The command of a format; `UnknownNameError` suggests the closest name."""
-        from acwm_core.data.formats import options_of
+        from acwm_formats.format import options_of
 
-        component = self._registry()[cmd_name]
+        component = _formats()[cmd_name]
         target = component.load()
-        own = [_parameter(*option, component.defaults) for option in options_of(target)]
+        if not getattr(target, f"{self._method}s")():
+            done = {"read": "imported", "write": "exported"}
+            other = done["write" if self._method == "read" else "read"]
+            raise DataError(f"{cmd_name} can only be {other}, not {done[self._method]}")
+        method = getattr(target, self._method)
+        own = [_parameter(*option) for option in options_of(method)]
 
         def run(**values: Any) -> None:
             given = {str(each.name): values.pop(str(each.name)) for each in own}
             if self._base.callback:
-                self._base.callback(component, given, **values)
+                self._base.callback(component.create(), given, **values)
 
         params = sorted([*own, *self._base.params], key=lambda p: isinstance(p, click.Option))
-        text = (inspect.getdoc(target) or "").partition("\nArgs:")[0]
+        text = (inspect.getdoc(method) or "").partition("\nArgs:")[0]
         return click.Command(cmd_name, params=params, callback=run, help=text)
 
-    def _registry(self) -> Registry:
-        from acwm_core.plugins import catalog
 
-        return catalog().registry(self._kind)
+def _formats() -> Registry:
+    from acwm_core.plugins import catalog
+
+    return catalog().registry("format")
 
 
-def _parameter(
-    parameter: inspect.Parameter, text: str, presets: Mapping[str, Any]
-) -> click.Parameter:
-    name, default = parameter.name, presets.get(parameter.name, parameter.default)
+def _chosen_format(args: list[str]) -> tuple[str | None, list[str]]:
+    """The value of ``--format`` in `args`, if it is there, and the other arguments."""
+    for place, word in enumerate(args):
+        if word == "--format" and place + 1 < len(args):
+            return args[place + 1], [*args[:place], *args[place + 2 :]]
+        if word.startswith("--format="):
+            return word.partition("=")[2], [*args[:place], *args[place + 1 :]]
+    return None, args
+
+
+def _parameter(parameter: inspect.Parameter, text: str) -> click.Parameter:
+    name, default = parameter.name, parameter.default
     settings: dict[str, Any] = {"type": _click_type(parameter.annotation)}
     if default is parameter.empty:
         settings["required"] = True
@@ -175,16 +212,15 @@ def _click_type(annotation: Any) -> Any:
 @click.command("import")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
 @click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
-def import_format(
-    component: Component, given: dict[str, Any], out: Path, workers: int | None
-) -> None:
+def import_format(source: Format, given: dict[str, Any], out: Path, workers: int | None) -> None:
     """Import recordings in another format as a dataset.
 
-    If it is interrupted, run the same command again to continue.
+    Without FORMAT or --format FORMAT, the format is found out from the files. If it is interrupted,
+    run the same command again to continue.
     """
-    from acwm_core.data.recordings import RecordedDataset, import_dataset
+    from acwm_formats.recordings import RecordedDataset, import_dataset
 
-    found = component.create(**given).read()
+    found = source.read(**given)
     several = {".": found} if isinstance(found, RecordedDataset) else found
     for name, recorded in several.items():
         card = import_dataset(recorded, out / name, workers=workers)
@@ -198,12 +234,12 @@ def import_format(
 @click.command("export")
 @click.argument("data", type=DATASET)
 @click.option("--out", type=OUT_FOLDER, required=True, help="Folder to create.")
-def export_format(component: Component, given: dict[str, Any], data: Path, out: Path) -> None:
-    """Export a dataset to another format."""
-    from acwm_core.data.formats import export_dataset
+def export_format(target: Format, given: dict[str, Any], data: Path, out: Path) -> None:
+    """Export a dataset to another format, given as FORMAT or by --format FORMAT."""
+    from acwm_formats.format import export_dataset
 
-    click.echo(f"wrote {export_dataset(data, out, component.create(**given))}")
+    click.echo(f"wrote {export_dataset(data, out, target, **given)}")
 
 
-data.add_command(FormatGroup("dataset_importer", import_format))
-data.add_command(FormatGroup("dataset_exporter", export_format))
+data.add_command(FormatGroup("read", import_format))
+data.add_command(FormatGroup("write", export_format))

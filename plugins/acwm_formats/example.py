@@ -1,4 +1,4 @@
-"""Small recordings for the conformance tests of importers."""
+"""Small recordings for the conformance tests of formats."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from acwm_core.data.formats import DatasetExporter, export_dataset
-from acwm_core.data.recordings import import_dataset
+from acwm_formats.format import Format, export_dataset
+from acwm_formats.recordings import import_dataset
 from acwm_formats.rollouts import Gymnasium
 
 
@@ -49,9 +49,9 @@ class Square(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 gymnasium.register("acwm_formats/Square-v0", f"{Square.__module__}:Square")
 
 
-def exported_example(folder: Path, exporter: DatasetExporter) -> Path:
+def exported_example(folder: Path, target: Format) -> Path:
     """Export a few rollouts of `Square` to another format; returns a folder below `folder`."""
     with tempfile.TemporaryDirectory() as data:
-        rollouts = Gymnasium(**Gymnasium.example(folder)).read()
+        rollouts = Gymnasium().read(**Gymnasium.example(folder))
         import_dataset(rollouts, data, workers=0, progress=False)
-        return export_dataset(data, folder / "square", exporter, progress=False)
+        return export_dataset(data, folder / "square", target, progress=False)

@@ -1,4 +1,4 @@
-"""Export to HDF5: one file per split, with bit-exact data."""
+"""The format HDF5: one file per split, with bit-exact data."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 import h5py
 
-from acwm_core.data.formats import DatasetExporter, Export
 from acwm_core.env.episode import Episode
+from acwm_formats.format import Export, Format
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
-class HDF5Exporter(DatasetExporter):
-    """Write HDF5: one file per split, with bit-exact data and the ground truth."""
+class HDF5(Format):
+    """HDF5: a file per split."""
 
     def write(self, export: Export) -> None:
-        """Write ``train.hdf5``, ``ind_test.hdf5`` and ``ood_test.hdf5``.
+        """Write HDF5: one file per split, with bit-exact data and the ground truth.
 
         Each file holds one group per episode, such as ``episode_000012``, with
 
@@ -43,6 +43,11 @@ class HDF5Exporter(DatasetExporter):
                         _write(file.create_group(f"episode_{episode.spec.index:06d}"), episode)
                         opened.check()
                 opened.check()
+
+    @classmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """None: it is only written."""
+        return {}
 
 
 class _PatientFile(io.FileIO):

@@ -1,4 +1,4 @@
-"""Export to a LeRobot dataset, version 3.0, written directly with pyarrow and PyAV."""
+"""Writes LeRobot datasets of version 3.0, directly with pyarrow and PyAV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.formats import DatasetExporter, Export
 from acwm_core.env.environment import EnvironmentCard, StateField
 from acwm_core.env.episode import Episode
 from acwm_formats.lerobot_layout import (
@@ -38,29 +37,6 @@ OWN = "observation.states."  # prefix of state fields that are separate features
 SHORT = 64  # state fields of at most this many numbers are joined to one vector
 
 
-class LeRobotExporter(DatasetExporter):
-    """Write a LeRobot dataset of version 3.0 with one camera.
-
-    Video is visually lossless, not bit-exact. The format cannot store masks, contacts and factors.
-    """
-
-    def write(self, export: Export) -> None:
-        """Write rows, video and statistics, one split after another.
-
-        State fields of up to 64 numbers are joined to `observation.state`. Larger ones become
-        separate features, with statistics of the whole dataset but not of each episode.
-        ``meta/acwm.json`` keeps the environment's card, so that an import knows units and bounds.
-        """
-        writer = _Writer(export.folder, export.card.environment)
-        splits: dict[str, str] = {}
-        for split in export.splits:
-            first = len(writer.episodes)
-            for episode in export.episodes(split):
-                writer.add(episode)
-            splits[split] = f"{first}:{len(writer.episodes)}"
-        writer.close(splits)
-
-
 class _Rolling:
     """Numbers files of one kind, and says when to begin the next one."""
 
@@ -86,8 +62,12 @@ class _Rolling:
         return {"chunk_index": chunk, "file_index": file}
 
 
-class _Writer:
-    """Writes rows, video and index, episode by episode."""
+class Writer:
+    """Writes rows, video and index of a LeRobot dataset, episode by episode.
+
+    Attributes:
+        episodes: the index of those that were added.
+    """
 
     def __init__(self, root: Path, card: EnvironmentCard) -> None:
         self._root, self._card, self._features = root, card, _features(card)

@@ -5,58 +5,37 @@ from acwm_core.plugins import Registry, hookimpl
 
 @hookimpl
 def register_kinds(registry: Registry) -> None:
-    """Add the kinds of component that read and write other formats."""
+    """Add the kind of component that reads and writes other formats."""
     registry.add(
-        "dataset_importer",
-        "acwm_core.data.formats:DatasetImporter",
-        summary="reads datasets in another format",
-        check="acwm_formats.checks:check_dataset_importer",
-    )
-    registry.add(
-        "dataset_exporter",
-        "acwm_core.data.formats:DatasetExporter",
-        summary="writes datasets in another format",
-        check="acwm_formats.checks:check_dataset_exporter",
+        "format",
+        "acwm_formats.format:Format",
+        summary="reads and writes datasets in another format",
+        check="acwm_formats.checks:check_format",
     )
 
 
 @hookimpl
-def register_dataset_importers(registry: Registry) -> None:
-    """Add importers for robot recordings, rollouts and the published release."""
+def register_formats(registry: Registry) -> None:
+    """Add formats of robot recordings, rollouts, the published release, and of every bit."""
     registry.add(
         "lerobot",
-        "acwm_formats.lerobot_import:LeRobot",
-        summary="a LeRobot dataset of version 3.0 or 2.x",
+        "acwm_formats.lerobot:LeRobot",
+        summary="a LeRobot dataset of version 3.0 or 2.x; written as 3.0, visually lossless",
     )
     registry.add(
         "gymnasium",
         "acwm_formats.rollouts:Gymnasium",
-        summary="rollouts of a Gymnasium environment",
+        summary="rollouts of a Gymnasium environment; only read",
     )
     registry.add(
         "acwm-phys",
         "acwm_formats.published:Published",
-        summary="the published ACWM-Phys release, or anything in its layout",
-    )
-
-
-@hookimpl
-def register_dataset_exporters(registry: Registry) -> None:
-    """Add two exporters with visually lossless video, and one that is bit-exact."""
-    registry.add(
-        "lerobot",
-        "acwm_formats.lerobot_export:LeRobotExporter",
-        summary="a LeRobot dataset of version 3.0, visually lossless",
-    )
-    registry.add(
-        "acwm-phys",
-        "acwm_formats.published:PublishedExporter",
-        summary="the layout of the published release, visually lossless",
+        summary="the layout of the published ACWM-Phys release; written visually lossless",
     )
     registry.add(
         "hdf5",
-        "acwm_formats.hdf5:HDF5Exporter",
-        summary="a file per split with every bit and the ground truth",
+        "acwm_formats.hdf5:HDF5",
+        summary="a file per split with every bit and the ground truth; only written",
         extra="hdf5",
         requires=("h5py",),
     )

@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import re
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.data.formats import DatasetExporter, DatasetImporter, Export, import_command
-from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
 from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.plugins import catalog
 from acwm_formats.example import exported_example
+from acwm_formats.format import Export, Format, import_command
 from acwm_formats.published_layout import (
     CITATION,
     ENVIRONMENTS,
@@ -33,6 +32,7 @@ from acwm_formats.published_layout import (
     Entry,
     read_entries,
 )
+from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
 from acwm_formats.video import shrunk, target_size, video_facts, video_frames
 
 LARGE = 1024  # square videos of this side are averaged down to `USUAL` by default
@@ -41,87 +41,129 @@ FPS = 10  # for videos without a frame rate
 OTHERS = "others"  # category of environments that are not in the release
 
 
-@dataclass(frozen=True)
-class Published(DatasetImporter):
-    """Import the published ACWM-Phys release.
+class Published(Format):
+    """The published ACWM-Phys release, or anything in its layout."""
 
-    ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several
-    environments, each of which becomes a dataset OUT/NAME. Videos of 1024×1024 become 240×240
-    unless --size says otherwise.
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether it is the folder of an environment, or holds some, one or two levels below."""
+        return any(
+            (place / METADATA).is_file()
+            for below in ("", "*/", "*/*/")
+            for name in FOLDERS
+            for place in path.glob(f"{below}{name}")
+        )
 
-    Args:
-        root: the folder of one environment, with some of ``ind_train``, ``ind_test`` and
-            ``ood_test`` in it, or a folder one or two levels above.
-        size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
-        environment: Name of the environment.
-    """
+    def read(
+        self,
+        root: Path,
+        *,
+        size: int | tuple[int, int] | None = None,
+        environment: str | None = None,
+    ) -> RecordedDataset | dict[str, RecordedDataset]:
+        """Import the published ACWM-Phys release.
 
-    root: Path
-    _: KW_ONLY
-    size: int | tuple[int, int] | None = None
-    environment: str | None = None
+        ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several
+        environments, each of which becomes a dataset OUT/NAME. Videos of 1024×1024 become 240×240
+        unless --size says otherwise.
 
-    def read(self) -> RecordedDataset | dict[str, RecordedDataset]:
-        """Read the dataset of one environment, or the datasets of several by name.
-
-        Raises:
-            DataError: a file is missing or damaged, holds code, or contradicts the others.
+        Args:
+            root: the folder of one environment, with some of ``ind_train``, ``ind_test`` and
+                ``ood_test`` in it, or a folder one or two levels above.
+            size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
+            environment: Name of the environment.
         """
-        root = Path(self.root)
+        root = Path(root)
         if _splits(root):
-            return self._dataset(root)
+            return _dataset(root, size, environment)
         folders = _folders(root)
-        if self.environment and len(folders) > 1:
+        if environment and len(folders) > 1:
             raise DataError(
                 f"{root} holds {len(folders)} environments: give --environment for one "
                 "folder at a time"
             )
         found: dict[str, RecordedDataset] = {}
         for folder in folders:
-            dataset = self._dataset(folder)
+            dataset = _dataset(folder, size, environment)
             name = dataset.environment.name
             if name in found:
                 raise DataError(f"{folder} is a second {name}: import one folder at a time")
             found[name] = dataset
         return found
 
+    def write(self, export: Export) -> None:
+        """Write the layout of the published ACWM-Phys release.
+
+        Video is H.264 (CRF 18): visually lossless, not bit-exact. Actions are normalised to [-1, 1]
+        by the card's bounds; the last row, which leads to no frame, is zero. The layout cannot
+        store states, masks, contacts and factors.
+        """
+        card = export.card.environment
+        category, name = PLACES.get(card.name, (OTHERS, card.name))
+        low, high = np.array(card.action.low), np.array(card.action.high)
+        folders = {split: folder for folder, split in FOLDERS.items()}
+        for split in export.splits:
+            folder = export.folder / category / name / folders[split]
+            folder.mkdir(parents=True)
+            entries: list[dict[str, Any]] = []
+            for episode in export.episodes(split):
+                index = episode.spec.index
+                video = f"episode_{index}.mp4"
+                write_mp4(folder / video, episode.video, card.fps)
+                normalised = np.clip(2 * (episode.actions - low) / (high - low) - 1, -1, 1)
+                normalised[-1] = 0
+                entries.append(
+                    {
+                        "video_path": f"{category}/{name}/{folders[split]}/{video}",
+                        "actions": torch.as_tensor(normalised, dtype=torch.float32),
+                        "length": len(episode.video),
+                        "seed": episode.spec.seed,
+                        "episode_idx": index,
+                    }
+                )
+            torch.save(entries, folder / METADATA)
+
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """Options for an example dataset, made by the exporter."""
-        return {"root": exported_example(folder, PublishedExporter())}
+        """An example dataset that `write` made."""
+        return {"root": exported_example(folder, cls())}
 
-    def _dataset(self, folder: Path) -> RecordedDataset:
-        places, size = _splits(folder), self.size
-        entries: dict[Split, list[Entry]] = {s: read_entries(places[s] / METADATA) for s in places}
-        split = next(iter(places))
-        video = video_facts(places[split] / entries[split][0].video)
-        if size is None and video.size == (LARGE, LARGE):
-            size = USUAL
-        name = folder.resolve().name
-        meaning = _meaning(self.environment or _environment_name(name), entries)
-        card = recorded_card(
-            meaning.name,
-            meaning.action,
-            frame_size=target_size(video.size, size),
-            fps=round(video.fps) or FPS,
-            horizon=max(_nominal(entry) for each in entries.values() for entry in each),
-            summary=meaning.summary,
-            citation=meaning.citation,
-        )
-        options = {"environment": self.environment, "size": card.frame_size}
-        facts = {
-            "kind": "acwm-phys",
-            "name": name,
-            "command": import_command("acwm-phys", name, **options),
-            "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
-        }
-        return RecordedDataset(
-            card,
-            {s: PublishedRecordings(place, len(entries[s]), card) for s, place in places.items()},
-            facts,
-            notes=(*meaning.notes, *_notes(places, entries)),
-            nominal={s: [entry.length for entry in entries[s]] for s in places},
-        )
+
+def _dataset(
+    folder: Path, size: int | tuple[int, int] | None, environment: str | None
+) -> RecordedDataset:
+    """The dataset of one environment."""
+    places = _splits(folder)
+    entries: dict[Split, list[Entry]] = {s: read_entries(places[s] / METADATA) for s in places}
+    split = next(iter(places))
+    video = video_facts(places[split] / entries[split][0].video)
+    if size is None and video.size == (LARGE, LARGE):
+        size = USUAL
+    name = folder.resolve().name
+    meaning = _meaning(environment or _environment_name(name), entries)
+    card = recorded_card(
+        meaning.name,
+        meaning.action,
+        frame_size=target_size(video.size, size),
+        fps=round(video.fps) or FPS,
+        horizon=max(_nominal(entry) for each in entries.values() for entry in each),
+        summary=meaning.summary,
+        citation=meaning.citation,
+    )
+    options = {"environment": environment, "size": card.frame_size}
+    facts = {
+        "kind": "acwm-phys",
+        "name": name,
+        "command": import_command("acwm-phys", name, **options),
+        "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
+    }
+    return RecordedDataset(
+        card,
+        {s: PublishedRecordings(place, len(entries[s]), card) for s, place in places.items()},
+        facts,
+        notes=(*meaning.notes, *_notes(places, entries)),
+        nominal={s: [entry.length for entry in entries[s]] for s in places},
+    )
 
 
 @dataclass(frozen=True)
@@ -258,39 +300,3 @@ def _notes(places: Mapping[Split, Path], entries: Mapping[Split, list[Entry]]) -
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-class PublishedExporter(DatasetExporter):
-    """Write the layout of the published ACWM-Phys release.
-
-    Video is visually lossless, not bit-exact. Actions are normalised to [-1, 1] by the card's
-    bounds; the last row, which leads to no frame, is zero. The layout cannot store states, masks,
-    contacts and factors.
-    """
-
-    def write(self, export: Export) -> None:
-        """Write ``CATEGORY/ENVIRONMENT/{ind_train,ind_test,ood_test}``, video as H.264 (CRF 18)."""
-        card = export.card.environment
-        category, name = PLACES.get(card.name, (OTHERS, card.name))
-        low, high = np.array(card.action.low), np.array(card.action.high)
-        folders = {split: folder for folder, split in FOLDERS.items()}
-        for split in export.splits:
-            folder = export.folder / category / name / folders[split]
-            folder.mkdir(parents=True)
-            entries: list[dict[str, Any]] = []
-            for episode in export.episodes(split):
-                index = episode.spec.index
-                video = f"episode_{index}.mp4"
-                write_mp4(folder / video, episode.video, card.fps)
-                normalised = np.clip(2 * (episode.actions - low) / (high - low) - 1, -1, 1)
-                normalised[-1] = 0
-                entries.append(
-                    {
-                        "video_path": f"{category}/{name}/{folders[split]}/{video}",
-                        "actions": torch.as_tensor(normalised, dtype=torch.float32),
-                        "length": len(episode.video),
-                        "seed": episode.spec.seed,
-                        "episode_idx": index,
-                    }
-                )
-            torch.save(entries, folder / METADATA)

@@ -1,12 +1,12 @@
-"""Import of rollouts in a Gymnasium environment: rendered frames while a policy acts."""
+"""Rollouts in Gymnasium environments as recordings: rendered frames while a policy acts."""
 
 from __future__ import annotations
 
 import functools
 import re
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,11 +17,11 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from acwm_core.data.formats import DatasetImporter, import_command
-from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
-from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.env.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
+from acwm_formats.format import Format, import_command
+from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
 from acwm_formats.video import shrunk, target_size
 
 RANDOM = "random"
@@ -32,112 +32,109 @@ Policy = Callable[[Any, np.random.Generator], Any]
 """Maps an observation and the random generator of the episode to an action."""
 
 
-@dataclass(frozen=True)
-class Gymnasium(DatasetImporter):
-    """Import rollouts of the Gymnasium environment ENV_ID, simulated during the import.
+class Gymnasium(Format):
+    """Rollouts in a Gymnasium environment, simulated when they are read."""
 
-    It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions from
-    a Box keep their values and bounds; actions from a Discrete become one-hot vectors. Observations
-    are kept as state if they are vectors.
+    def read(
+        self,
+        env_id: str,
+        *,
+        episodes: tuple[int, ...],
+        policy: str = RANDOM,
+        seed: int = 0,
+        frames: int = 1000,
+        size: int | tuple[int, int] | None = None,
+        environment: str | None = None,
+    ) -> RecordedDataset:
+        """Import rollouts of the Gymnasium environment ENV_ID, simulated during the import.
 
-    Args:
-        env_id: id of the environment, as for `gymnasium.make`.
-        episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
-            default.
-        policy: Who acts: random, or module:function of an observation and a random generator.
-        seed: Seed of the dataset: of every episode's start and policy.
-        frames: End episodes after this many frames.
-        size: Frame size, 64 or HEIGHTxWIDTH; by default that of the rendered frames.
-        environment: Name of the environment.
-    """
+        It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions
+        from a Box keep their values and bounds; actions from a Discrete become one-hot vectors.
+        Observations are kept as state if they are vectors.
 
-    env_id: str
-    _: KW_ONLY
-    episodes: tuple[int, ...]
-    policy: str = RANDOM
-    seed: int = 0
-    frames: int = 1000
-    size: int | tuple[int, int] | None = None
-    environment: str | None = None
-
-    def read(self) -> RecordedDataset:
-        """Play one episode to find out the frame size, the length and the states.
-
-        Raises:
-            RecipeError: there is no such environment or policy, or no episode to play.
-            DataError: the environment renders no frames, or its actions are of an unsupported kind
-                or have no bounds.
+        Args:
+            env_id: id of the environment, as for `gymnasium.make`.
+            episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
+                default.
+            policy: Who acts: random, or module:function of an observation and a random generator.
+            seed: Seed of the dataset: of every episode's start and policy.
+            frames: End episodes after this many frames.
+            size: Frame size, 64 or HEIGHTxWIDTH; by default that of the rendered frames.
+            environment: Name of the environment.
         """
-        counts, name = self._counts(), self._name()
-        env = _environment(self.env_id)
-        action = _action(self.env_id, env.action_space)
+        counts, name = _counts(episodes, frames), _name(env_id, environment)
+        env = _environment(env_id)
         made: dict[Split, Rollouts] = {
-            split: Rollouts(
-                self.env_id, self.policy, EpisodeSpec(name, split, seed=self.seed), self.frames, n
-            )
-            for split, n in counts.items()
-            if n
+            split: Rollouts(env_id, policy, EpisodeSpec(name, split, seed=seed), frames, count)
+            for split, count in counts.items()
+            if count
         }
         if not made:
             raise RecipeError("there are no episodes to make: every split has 0")
-        probe = next(iter(made.values()))[0]
-        limit = env.spec.max_episode_steps if env.spec else None
+        card = _card(env, next(iter(made.values())), size)
         fps = env.metadata.get("render_fps")
-        card = recorded_card(
-            name,
-            action,
-            frame_size=target_size((probe.video.shape[1], probe.video.shape[2]), self.size),
-            fps=round(fps or FPS),
-            horizon=min(self.frames, limit + 1) if limit else probe.frames,
-            state=[
-                StateField(n, rows.shape[1:], "", "as observed") for n, rows in probe.states.items()
-            ],
-            summary=f"{self.env_id} under the policy {self.policy}",
-            engine="Gymnasium",
-        )
-        splits: dict[Split, Rollouts] = {
-            split: replace(rollouts, size=card.frame_size) for split, rollouts in made.items()
+        options: dict[str, Any] = {
+            "episodes": ",".join(map(str, counts.values())),
+            "policy": policy,
+            "seed": seed,
+            "frames": frames,
+            "environment": environment,
+            "size": card.frame_size,
         }
-        notes = () if fps else (f"The environment has no render_fps; {FPS} are assumed.",)
-        facts = self._facts(counts, card.frame_size)
-        return RecordedDataset(card, splits, facts, notes, self.seed)
+        return RecordedDataset(
+            card,
+            {split: replace(rollouts, size=card.frame_size) for split, rollouts in made.items()},
+            facts={
+                "kind": "gymnasium",
+                "name": env_id,
+                "command": import_command("gymnasium", env_id, **options),
+                "version": version("gymnasium"),
+            },
+            notes=() if fps else (f"The environment has no render_fps; {FPS} are assumed.",),
+            seed=seed,
+        )
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """Options for a toy environment that needs no other package."""
+        """A toy environment that needs no other package."""
         square = "acwm_formats.example:acwm_formats/Square-v0"
         return {"env_id": square, "episodes": (2, 1), "frames": 6}
 
-    def _counts(self) -> dict[Split, int]:
-        if not 1 <= len(self.episodes) <= 2 or min(self.episodes) < 0:
-            given = ",".join(map(str, self.episodes))
-            raise RecipeError(f"--episodes {given}: give a number such as 100, or 100,10")
-        if self.frames < 2:
-            raise RecipeError(
-                f"--frames {self.frames}: give at least 2, with an action between them"
-            )
-        train, *test = self.episodes
-        return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 
-    def _name(self) -> str:
-        name = re.sub(r"-v\d+$", "", self.env_id.rpartition("/")[2].rpartition(":")[2])
-        return re.sub(r"\W+", "_", self.environment or name).strip("_").lower()
+def _counts(episodes: tuple[int, ...], frames: int) -> dict[Split, int]:
+    if not 1 <= len(episodes) <= 2 or min(episodes) < 0:
+        given = ",".join(map(str, episodes))
+        raise RecipeError(f"--episodes {given}: give a number such as 100, or 100,10")
+    if frames < 2:
+        raise RecipeError(f"--frames {frames}: give at least 2, with an action between them")
+    train, *test = episodes
+    return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 
-    def _facts(self, counts: Mapping[Split, int], size: tuple[int, int]) -> dict[str, Any]:
-        options: dict[str, Any] = {
-            "episodes": ",".join(str(counts[split]) for split in counts),
-            "policy": self.policy,
-            "seed": self.seed,
-            "frames": self.frames,
-            "environment": self.environment,
-            "size": size,
-        }
-        return {
-            "kind": "gymnasium",
-            "name": self.env_id,
-            "command": import_command("gymnasium", self.env_id, **options),
-            "version": version("gymnasium"),
-        }
+
+def _name(env_id: str, given: str | None) -> str:
+    name = re.sub(r"-v\d+$", "", env_id.rpartition("/")[2].rpartition(":")[2])
+    return re.sub(r"\W+", "_", given or name).strip("_").lower()
+
+
+def _card(
+    env: gymnasium.Env[Any, Any], rollouts: Rollouts, size: int | tuple[int, int] | None
+) -> EnvironmentCard:
+    """What an environment shows: an episode is played to find out size, length and states."""
+    action = _action(rollouts.env_id, env.action_space)
+    limit, probe = env.spec.max_episode_steps if env.spec else None, rollouts[0]
+    return recorded_card(
+        rollouts.spec.environment,
+        action,
+        frame_size=target_size((probe.video.shape[1], probe.video.shape[2]), size),
+        fps=round(env.metadata.get("render_fps") or FPS),
+        horizon=min(rollouts.frames, limit + 1) if limit else probe.frames,
+        state=[
+            StateField(name, rows.shape[1:], "", "as observed")
+            for name, rows in probe.states.items()
+        ],
+        summary=f"{rollouts.env_id} under the policy {rollouts.policy}",
+        engine="Gymnasium",
+    )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
-from acwm_core.data.recordings import recorded_card
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
@@ -269,4 +268,16 @@ def _card(video: Video) -> EnvironmentCard:
     """The card of an environment of which only the frame size is known."""
     action = ActionSpec(("action",), ("",), (-1.0,), (1.0,), "absolute")
     size = video.shape[-2], video.shape[-1]
-    return recorded_card("video", action, frame_size=size, fps=1, horizon=video.shape[1])
+    return EnvironmentCard(
+        name="video",
+        summary="",
+        action=action,
+        frame_size=size,
+        fps=1,
+        horizon=video.shape[1],
+        factors=(),
+        ood_shifts=(),
+        state=(),
+        instances=("unlabelled",),
+        engine="recorded",
+    )

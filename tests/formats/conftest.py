@@ -8,8 +8,8 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
-from acwm_core.data.recordings import import_dataset
 from acwm_formats.published import Published
+from acwm_formats.recordings import import_dataset
 from tests.folders import checksums as checksums
 from tests.formats import release
 
@@ -47,7 +47,7 @@ def folder(published, tmp_path):
 
 
 def load_published(folder, out, workers=0, shard_episodes=2, **options):
-    recorded = Published(folder, **options).read()
+    recorded = Published().read(folder, **options)
     return import_dataset(
         recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
     )

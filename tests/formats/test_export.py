@@ -17,14 +17,13 @@ import torch
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.formats import export_dataset
-from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
 from acwm_formats import lerobot_export
-from acwm_formats.hdf5 import HDF5Exporter
-from acwm_formats.lerobot_export import LeRobotExporter
-from acwm_formats.lerobot_import import LeRobot
-from acwm_formats.published import Published, PublishedExporter
+from acwm_formats.format import export_dataset
+from acwm_formats.hdf5 import HDF5
+from acwm_formats.lerobot import LeRobot
+from acwm_formats.published import Published
+from acwm_formats.recordings import import_dataset
 from tests.formats.conftest import episodes_of, psnr
 
 ROOT = Path(__file__).parents[2]
@@ -49,11 +48,11 @@ def looks_like(shown, truth):
 
 @pytest.fixture(scope="module")
 def lerobot(simulated, tmp_path_factory):
-    return export(simulated, tmp_path_factory.mktemp("exports") / "lerobot", LeRobotExporter())
+    return export(simulated, tmp_path_factory.mktemp("exports") / "lerobot", LeRobot())
 
 
 def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
-    export(simulated, tmp_path / "out", PublishedExporter())
+    export(simulated, tmp_path / "out", Published())
     for split, folder in (("train", "ind_train"), ("ind_test", "ind_test"), ("ood_test",) * 2):
         place = tmp_path / "out/rigid_dynamics/push_block" / folder
         entries = torch.load(place / "metadata.pt", weights_only=True)
@@ -73,8 +72,8 @@ def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
 
 
 def test_the_published_layout_comes_back(simulated, tmp_path):
-    export(simulated, tmp_path / "out", PublishedExporter())
-    recorded = Published(tmp_path / "out/rigid_dynamics/push_block").read()
+    export(simulated, tmp_path / "out", Published())
+    recorded = Published().read(tmp_path / "out/rigid_dynamics/push_block")
     card = import_dataset(recorded, tmp_path / "back", workers=0, progress=False)
     assert card.splits == DatasetCard.read(simulated).splits
     assert card.environment.action == DatasetCard.read(simulated).environment.action
@@ -84,7 +83,7 @@ def test_the_published_layout_comes_back(simulated, tmp_path):
 
 
 def test_hdf5_keeps_every_bit(simulated, tmp_path):
-    export(simulated, tmp_path / "out", HDF5Exporter())
+    export(simulated, tmp_path / "out", HDF5())
     files = {path.stem for path in (tmp_path / "out").iterdir()}
     assert files == {"train", "ind_test", "ood_test"}
     for split in files:
@@ -175,7 +174,7 @@ def test_lerobot_statistics_are_those_of_the_rows(lerobot):
 
 
 def test_lerobot_comes_back_with_names_units_and_bounds(lerobot, simulated, tmp_path):
-    card = import_dataset(LeRobot(lerobot).read(), tmp_path / "back", workers=0, progress=False)
+    card = import_dataset(LeRobot().read(lerobot), tmp_path / "back", workers=0, progress=False)
     ours = DatasetCard.read(simulated)
     assert (card.splits, card.environment.action) == (ours.splits, ours.environment.action)
     assert card.environment.name == "push_cube"
@@ -188,12 +187,12 @@ def test_many_files_hold_what_one_does(lerobot, simulated, tmp_path, monkeypatch
     monkeypatch.setattr(lerobot_export, "DATA_MB", 0)
     monkeypatch.setattr(lerobot_export, "VIDEO_MB", 0)
     monkeypatch.setattr(lerobot_export, "CHUNK_FILES", 2)
-    root = export(simulated, tmp_path / "many", LeRobotExporter())
+    root = export(simulated, tmp_path / "many", LeRobot())
     names = [f"chunk-{i // 2:03d}/file-{i % 2:03d}" for i in range(7)]
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("data/*/*"))] == names
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("videos/*/*/*"))] == names
     for folder, place in (("one", lerobot), ("many_back", root)):
-        recorded = LeRobot(place, environment="same").read()
+        recorded = LeRobot().read(place, environment="same")
         import_dataset(recorded, tmp_path / folder, workers=0, progress=False)
     both = episodes_of(tmp_path / "one"), episodes_of(tmp_path / "many_back")
     for a, b in zip(*both, strict=True):
@@ -203,7 +202,7 @@ def test_many_files_hold_what_one_does(lerobot, simulated, tmp_path, monkeypatch
 
 def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch):
     monkeypatch.setattr(lerobot_export, "SHORT", 1)
-    root = export(simulated, tmp_path / "out", LeRobotExporter())
+    root = export(simulated, tmp_path / "out", LeRobot())
     features = json.loads((root / "meta/info.json").read_text())["features"]
     rows = pq.read_table(root / "data/chunk-000/file-000.parquet")
     episode = episodes_of(simulated)[0]
@@ -215,7 +214,7 @@ def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch
     assert "observation.states.pusher_position" in whole
     index = pq.read_schema(root / "meta/episodes/chunk-000/file-000.parquet").names
     assert not any(name.startswith("stats/observation.states") for name in index)
-    back = import_dataset(LeRobot(root).read(), tmp_path / "back", workers=0, progress=False)
+    back = import_dataset(LeRobot().read(root), tmp_path / "back", workers=0, progress=False)
     fields = {field.name: field.shape for field in back.environment.state}
     assert fields["observation.states.pusher_position"] == (flat.shape[1],)
 
@@ -223,7 +222,7 @@ def test_large_states_are_features_of_their_own(simulated, tmp_path, monkeypatch
 def test_exports_are_whole_or_not_there(simulated, tmp_path):
     out = tmp_path / "out"
 
-    class Failing(HDF5Exporter):
+    class Failing(HDF5):
         def write(self, given):
             super().write(given)
             raise OSError(28, "No space left on device")
@@ -234,10 +233,10 @@ def test_exports_are_whole_or_not_there(simulated, tmp_path):
     out.mkdir()
     (out / "mine").touch()
     with pytest.raises(DataError, match="already exists"):
-        export(simulated, out, HDF5Exporter())
+        export(simulated, out, HDF5())
     assert [path.name for path in out.iterdir()] == ["mine"]
     with pytest.raises(DataError, match="no dataset in"):
-        export(tmp_path / "nowhere", tmp_path / "other", HDF5Exporter())
+        export(tmp_path / "nowhere", tmp_path / "other", HDF5())
 
 
 def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
@@ -258,5 +257,5 @@ def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert not out.exists()
     assert list(tmp_path.glob(".out.partial/out/videos/*/*/*"))
-    export(simulated, out, LeRobotExporter())
+    export(simulated, out, LeRobot())
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

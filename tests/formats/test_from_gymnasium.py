@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.check import check_dataset
+from acwm_formats.recordings import import_dataset
 from acwm_formats.rollouts import Gymnasium
 from tests.formats import toy_envs
 
@@ -21,7 +21,7 @@ COUNTS = (3, 2)
 
 
 def load(env_id, out, workers=0, shard_episodes=2, **options):
-    recorded = Gymnasium(env_id, **{"episodes": COUNTS, "frames": 12} | options).read()
+    recorded = Gymnasium().read(env_id, **{"episodes": COUNTS, "frames": 12} | options)
     return import_dataset(
         recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
     )

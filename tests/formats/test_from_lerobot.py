@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.recordings import import_dataset
 from acwm_core.errors import DataError
 from acwm_formats.check import check_dataset
-from acwm_formats.lerobot_import import LeRobot
+from acwm_formats.lerobot import LeRobot
+from acwm_formats.recordings import import_dataset
 from tests.formats import release
 from tests.formats.conftest import episodes_of, psnr
 
@@ -22,7 +22,7 @@ LENGTHS = (9, 7, 8, 6)
 
 
 def load(root, out, workers=0, **options):
-    recorded = LeRobot(root, **options).read()
+    recorded = LeRobot().read(root, **options)
     return import_dataset(recorded, out, workers=workers, shard_episodes=2, progress=False)
 
 
@@ -78,15 +78,15 @@ def test_what_the_library_wrote_comes_in(kind, tmp_path):
 
 
 def test_splits_are_the_datasets_own_or_the_last_episodes(root):
-    assert {s: len(r) for s, r in LeRobot(root, test_episodes=1).read().splits.items()} == {
+    assert {s: len(r) for s, r in LeRobot().read(root, test_episodes=1).splits.items()} == {
         "train": 3,
         "ind_test": 1,
     }
-    assert set(LeRobot(root, test_episodes=0).read().splits) == {"train"}
+    assert set(LeRobot().read(root, test_episodes=0).splits) == {"train"}
     with pytest.raises(DataError, match="4 of 4 episodes cannot be set aside"):
-        LeRobot(root, test_episodes=4).read()
+        LeRobot().read(root, test_episodes=4)
     change_info(root, splits={"train": "0:1", "test": "1:3", "val": "3:4"})
-    splits = LeRobot(root).read().splits
+    splits = LeRobot().read(root).splits
     assert {s: list(r.episodes) for s, r in splits.items()} == {"train": [0, 3], "ind_test": [1, 2]}
 
 
@@ -117,13 +117,13 @@ def test_names_in_any_form_and_dimensions_that_never_move(root):
     ):
         action["names"] = names
         change_info(root, features=info["features"])
-        assert LeRobot(root).read().environment.action.names == found
+        assert LeRobot().read(root).environment.action.names == found
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     still = pa.array([[1.0, 0.5]] * len(table), pa.list_(pa.float32()))
     place = table.schema.get_field_index("action")
     pq.write_table(table.set_column(place, "action", still), path)
-    spec = LeRobot(root).read().environment.action
+    spec = LeRobot().read(root).environment.action
     assert (spec.low, spec.high) == ((0.0, -0.5), (2.0, 1.5))
 
 
@@ -200,17 +200,17 @@ def spoil(path):
 def test_what_misleads_is_refused(root, change, problem):
     change(root)
     with pytest.raises(DataError, match=problem):
-        LeRobot(root).read()
+        LeRobot().read(root)
 
 
 def test_a_damaged_video_and_a_wrong_camera_are_named(root, tmp_path):
     with pytest.raises(DataError, match=r"did you mean 'observation\.images\.top'"):
-        LeRobot(root, camera="observation.images.to").read()
+        LeRobot().read(root, camera="observation.images.to")
     with pytest.raises(DataError, match="cannot be enlarged"):
-        LeRobot(root, size=128).read()
+        LeRobot().read(root, size=128)
     video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
     content = bytearray(video.read_bytes())
-    recorded = LeRobot(root).read()
+    recorded = LeRobot().read(root)
     video.write_bytes(b"text")
     with pytest.raises(DataError, match=r"episode 0 of train: the video .*file-000\.mp4 cannot"):
         import_dataset(recorded, tmp_path / "data", workers=0, progress=False)
@@ -231,7 +231,7 @@ def test_actions_that_are_none_are_refused(root):
     ):
         pq.write_table(table.set_column(place, "action", values), path)
         with pytest.raises(DataError, match=problem):
-            LeRobot(root).read()
+            LeRobot().read(root)
     pq.write_table(table.drop_columns(["action"]), path)
     with pytest.raises(DataError, match="cannot be read"):
-        LeRobot(root).read()
+        LeRobot().read(root)

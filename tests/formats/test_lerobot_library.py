@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from acwm_core.data.formats import export_dataset
-from acwm_formats.lerobot_export import LeRobotExporter
+from acwm_formats.format import export_dataset
+from acwm_formats.lerobot import LeRobot
 from tests.formats.conftest import episodes_of
 
 datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", exc_type=ImportError)
 
 
 def test_the_library_reads_it(simulated, tmp_path):
-    root = export_dataset(simulated, tmp_path / "out", LeRobotExporter(), progress=False)
+    root = export_dataset(simulated, tmp_path / "out", LeRobot(), progress=False)
     found = datasets.LeRobotDataset("acwm/push_cube", root=root)
     episodes = episodes_of(simulated)
     assert (found.num_episodes, len(found)) == (7, sum(len(e.video) for e in episodes))

@@ -84,7 +84,7 @@ def test_the_aggregate_counts_and_pieces_do_not(folder, tmp_path):
     assert any("train: 2 pieces of metadata left aside" in note for note in card.source["notes"])
     (folder / "ind_train" / "metadata.pt").unlink()
     with pytest.raises(DataError, match=r"pieces of the metadata .* but no metadata\.pt"):
-        Published(folder).read()
+        Published().read(folder)
 
 
 def test_paths_of_any_machine_and_numbers_of_any_kind(folder, tmp_path):
@@ -128,7 +128,7 @@ def test_large_videos_are_averaged_down(tmp_path):
     mean = frames.reshape(2, 64, 16, 64, 16, 3).mean((2, 4))
     assert psnr(EpisodeDataset(tmp_path / "small", "ind_test")[0].video, mean) > 40
     with pytest.raises(DataError, match="cannot be enlarged"):
-        Published(place.parent, size=2048).read()
+        Published().read(place.parent, size=2048)
 
 
 def test_actions_of_another_size_take_the_variant_or_made_up_names(tmp_path):
@@ -153,21 +153,21 @@ def test_actions_beyond_the_bounds_widen_them_and_are_told(folder, tmp_path):
 def test_a_whole_release_is_a_folder_per_environment(tmp_path):
     for place in ("rigid_dynamics/push_block", "kinematics/reacher"):
         release.environment(tmp_path / "release" / place, splits={"ind_test": 1}, length=3)
-    found = Published(tmp_path / "release").read()
+    found = Published().read(tmp_path / "release")
     assert {name: each.facts["name"] for name, each in found.items()} == {
         "reacher": "reacher",
         "push_cube": "push_block",
     }
-    assert [*Published(tmp_path / "release/kinematics").read()] == ["reacher"]
-    one = Published(tmp_path / "release/kinematics/reacher").read()
+    assert [*Published().read(tmp_path / "release/kinematics")] == ["reacher"]
+    one = Published().read(tmp_path / "release/kinematics/reacher")
     assert one.environment.name == "reacher"
     with pytest.raises(DataError, match="holds 2 environments: give --environment for one"):
-        Published(tmp_path / "release", environment="mine").read()
+        Published().read(tmp_path / "release", environment="mine")
     release.environment(tmp_path / "release/other/reacher", splits={"ind_test": 1}, length=3)
     with pytest.raises(DataError, match="is a second reacher"):
-        Published(tmp_path / "release").read()
+        Published().read(tmp_path / "release")
     with pytest.raises(DataError, match="not in the published layout"):
-        Published(tmp_path / "nowhere").read()
+        Published().read(tmp_path / "nowhere")
 
 
 def test_a_killed_import_resumes_where_it_was(published, tmp_path):

@@ -46,7 +46,7 @@ def test_pickled_code_is_not_run(folder, tmp_path, zipped):
 def test_what_is_no_metadata_is_refused(folder, content):
     (folder / "ind_train" / "metadata.pt").write_bytes(content)
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        Published(folder).read()
+        Published().read(folder)
 
 
 def test_cut_and_swollen_metadata_are_refused(folder):
@@ -54,7 +54,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        Published(folder).read()
+        Published().read(folder)
     swollen = io.BytesIO()
     with (
         zipfile.ZipFile(swollen, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -64,7 +64,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
             member.write(bytes(2**20))
     path.write_bytes(swollen.getvalue())  # a megabyte
     with pytest.raises(DataError, match="would need more than 1024 MB"):
-        Published(folder).read()
+        Published().read(folder)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
 def test_entries_that_cannot_be_are_refused(folder, change, problem):
     release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
     with pytest.raises(DataError, match=problem):
-        Published(folder).read()
+        Published().read(folder)
 
 
 def test_videos_that_cannot_be_are_refused(folder, tmp_path):

@@ -3,7 +3,6 @@
 import importlib
 import re
 import types
-from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,47 +12,51 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
-from acwm_core.data.formats import DatasetExporter, DatasetImporter, import_command
-from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
 from acwm_core.env.environment import ActionSpec
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, PluginError
 from acwm_core.plugins import catalog, hookimpl
-from acwm_formats.checks import check_dataset_exporter, check_dataset_importer
+from acwm_formats.checks import check_format
+from acwm_formats.format import Format, import_command
+from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
 from tests.checks.results import failures, installed
 
 ACTION = ActionSpec(("x",), ("",), (-1.0,), (1.0,), "delta")
 
 
-@dataclass(frozen=True)
-class Folder(DatasetImporter):
-    """Import the .npz files in the folder ROOT.
+class Folder(Format):
+    """.npz files, read or written as raw frames."""
 
-    Args:
-        root: the folder.
-        rate: Frames per second.
-        order: Which file is the first.
-        mirror: Whether to mirror frames.
-        skip: Numbers of files to leave out.
-    """
+    @classmethod
+    def detect(cls, path):
+        return any(path.glob("*.npz"))
 
-    root: Path
-    _: KW_ONLY
-    rate: float = 10.0
-    order: Literal["up", "down"] = "up"
-    mirror: bool = False
-    skip: tuple[int, ...] = ()
+    def read(
+        self,
+        root: Path,
+        *,
+        rate: float = 10.0,
+        order: Literal["up", "down"] = "up",
+        mirror: bool = False,
+        skip: tuple[int, ...] = (),
+    ) -> RecordedDataset:
+        """Import the .npz files in the folder ROOT.
 
-    def read(self) -> RecordedDataset:
-        files = sorted(Path(self.root).glob("*.npz"), reverse=self.order == "down")
+        Args:
+            root: the folder.
+            rate: Frames per second.
+            order: Which file is the first.
+            mirror: Whether to mirror frames.
+            skip: Numbers of files to leave out.
+        """
+        files = sorted(Path(root).glob("*.npz"), reverse=order == "down")
         if not files:
-            raise DataError(f"{self.root} has no .npz file")
-        kept = [file for i, file in enumerate(files) if i not in self.skip]
-        recordings = [_read(file, self.mirror) for file in kept]
+            raise DataError(f"{root} has no .npz file")
+        recordings = [_read(file, mirror) for i, file in enumerate(files) if i not in skip]
         card = recorded_card(
-            "mine", ACTION, frame_size=(16, 16), fps=round(self.rate), horizon=4, summary="Mine."
+            "mine", ACTION, frame_size=(16, 16), fps=round(rate), horizon=4, summary="Mine."
         )
-        facts = {"kind": "npz", "name": Path(self.root).name}
-        facts["command"] = import_command("npz", facts["name"], rate=self.rate)
+        facts = {"kind": "npz", "name": Path(root).name}
+        facts["command"] = import_command("npz", facts["name"], rate=rate)
         return RecordedDataset(card, {"train": recordings}, facts)
 
     @classmethod
@@ -70,37 +73,34 @@ def _read(path, mirror):
     return Recording(file["video"][:, :, :: -1 if mirror else 1], file["actions"])
 
 
-class ToFolder(DatasetExporter):
-    """Write a .npz file per episode.
+class ToFolder(Format):
+    """A .npz file per episode."""
 
-    Args:
-        digits: How many digits the names have.
-    """
+    def write(self, export, *, digits: int = 3):
+        """Write a .npz file per episode.
 
-    def __init__(self, *, digits: int = 2):
-        self.digits = digits
-
-    def write(self, export):
+        Args:
+            digits: How many digits the names have.
+        """
         for split in export.splits:
             for i, episode in enumerate(export.episodes(split)):
-                path = export.folder / f"{split}_{i:0{self.digits}d}.npz"
+                path = export.folder / f"{split}_{i:0{digits}d}.npz"
                 path.write_bytes(episode.video.tobytes())
 
+    @classmethod
+    def example(cls, folder):
+        return {}
+
 
 @hookimpl
-def register_dataset_importers(registry):
+def register_formats(registry):
     registry.add("npz", f"{__name__}:Folder", summary="a folder of .npz files")
-
-
-@hookimpl
-def register_dataset_exporters(registry):
-    registry.add("raw", f"{__name__}:ToFolder", summary="raw frames", digits=3)
+    registry.add("raw", f"{__name__}:ToFolder", summary="raw frames")
 
 
 @pytest.fixture
 def third_party(fresh_catalog):
-    hooks = register_dataset_importers, register_dataset_exporters
-    plugin = types.SimpleNamespace(**{hook.__name__: hook for hook in hooks})
+    plugin = types.SimpleNamespace(register_formats=register_formats)
     catalog().add_plugin(plugin, "third_party")
 
 
@@ -115,7 +115,7 @@ def said(*words):
 
 
 def test_it_is_listed_with_its_options(third_party):
-    assert "third_party" in said("list", "dataset_importer").output
+    assert "third_party" in said("list", "format").output
     assert "a folder of .npz files" in said("data", "import", "--help").output
     text = " ".join(said("data", "import", "npz", "--help").output.split())
     assert "npz [OPTIONS] ROOT Import the .npz files in the folder ROOT." in text
@@ -151,8 +151,12 @@ def test_it_imports_and_exports(third_party, root, tmp_path):
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (["import", "npx", "."], "unknown dataset importer 'npx'; did you mean 'npz'?"),
-        (["export", "rav", "."], "unknown dataset exporter 'rav'; did you mean 'raw'?"),
+        (["import", "npx", "."], "unknown format 'npx'; did you mean 'npz'?"),
+        (["export", "rav", "."], "unknown format 'rav'; did you mean 'raw'?"),
+        (["import", "raw", "."], "raw can only be exported, not imported"),
+        (["export", "npz", "."], "npz can only be imported, not exported"),
+        (["import", "."], ". is in no format that is known: give --format, one of"),
+        (["import", ".", "--format", "npx"], "unknown format 'npx'; did you mean 'npz'?"),
         (["import", "npz", ".", "--rates", "5"], "No such option '--rates'"),
         (["import", "npz", ".", "--rate", "x"], "Invalid value for '--rate'"),
         (["import", "npz", ".", "--order", "left"], "Invalid value for '--order'"),
@@ -172,46 +176,96 @@ def test_mistakes_are_one_sentence(third_party, words, problem, tmp_path):
 def test_the_command_line_checks_it(third_party):
     done = said("check", "npz")
     assert done.exit_code == 0, done.output
-    assert "dataset_importer npz" in done.output
+    assert "format npz" in done.output
     assert "ok    imports its example" in done.output
 
 
-@pytest.mark.parametrize("component", installed("dataset_importer"), ids=lambda c: c.name)
-def test_installed_importers_conform(component):
-    assert failures(check_dataset_importer(component.name)) == {}
+def test_a_path_tells_its_format(third_party, root, tmp_path):
+    for number, words in enumerate([[root], [root, "--format", "npz"], ["--format=npz", root]]):
+        out = tmp_path / str(number)
+        done = said("data", "import", *words, "--out", out, "--workers", 0, "--rate", 5)
+        assert done.exit_code == 0, done.output
+        assert ("is in the format npz" in done.output) == (number == 0)
+        assert DatasetCard.read(out) == DatasetCard.read(tmp_path / "0")
+    done = said("data", "export", out, "--format", "raw", "--out", tmp_path / "raw")
+    assert done.exit_code == 0, done.output
 
 
-@pytest.mark.parametrize("component", installed("dataset_exporter"), ids=lambda c: c.name)
-def test_installed_exporters_conform(component):
-    assert failures(check_dataset_exporter(component.name)) == {}
+def test_a_path_in_two_formats_needs_a_name(third_party, root, tmp_path):
+    catalog().registry("format").add("also", f"{__name__}:Folder")
+    done = said("data", "import", root, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "is in several formats: give --format, one of also, npz" in done.stderr
+
+
+def test_hooks_of_the_release_before_are_told(fresh_catalog):
+    @hookimpl
+    def register_dataset_importers(registry):
+        pass
+
+    plugin = types.SimpleNamespace(register_dataset_importers=register_dataset_importers)
+    with pytest.raises(PluginError, match=r"one `acwm_formats\.format\.Format` with `detect`"):
+        catalog().add_plugin(plugin, "old")
+
+
+@pytest.mark.parametrize("component", installed("format"), ids=lambda c: c.name)
+def test_installed_formats_conform(component):
+    assert failures(check_format(component.name)) == {}
 
 
 class Changing(Folder):
     """Never the same twice."""
 
-    def read(self):
-        recorded, count = super().read(), len(list(self.root.iterdir()))
-        (self.root / f"{count}.npz").write_bytes((self.root / "0.npz").read_bytes())
+    def read(self, root: Path):
+        """Read.
+
+        Args:
+            root: the folder.
+        """
+        recorded, count = super().read(root), len(list(root.iterdir()))
+        (root / f"{count}.npz").write_bytes((root / "0.npz").read_bytes())
         return recorded
 
 
 class Untyped(Folder):
-    """Takes anything.
+    """Takes anything."""
 
-    Args:
-        root: the folder.
-    """
+    def read(self, root: Path, *, untyped=1):
+        """Read.
 
-    def __init__(self, root: Path, *, untyped=1):
-        super().__init__(root)
+        Args:
+            root: the folder.
+        """
+        return super().read(root)
 
 
 class NoTraining(Folder):
     """Nothing to train on."""
 
-    def read(self):
-        found = super().read()
+    def read(self, root: Path):
+        """Read.
+
+        Args:
+            root: the folder.
+        """
+        found = super().read(root)
         return RecordedDataset(found.environment, {"ind_test": found.splits["train"]}, found.facts)
+
+
+class Everything(Folder):
+    """Takes every folder for its own."""
+
+    @classmethod
+    def detect(cls, path):
+        return True
+
+
+class Shy(Folder):
+    """Does not know its own."""
+
+    @classmethod
+    def detect(cls, path):
+        return False
 
 
 class Nothing(ToFolder):
@@ -229,14 +283,19 @@ class Numbered(ToFolder):
 
 
 class Taken(ToFolder):
-    """Write.
+    def write(self, export, *, out: int = 3):
+        """Write.
 
-    Args:
-        out: What every exporter has.
-    """
+        Args:
+            out: What every format has.
+        """
+        super().write(export, digits=out)
 
-    def __init__(self, *, out: int = 3):
-        super().__init__(digits=out)
+
+class Strange(Folder):
+    """Reads other files than it writes."""
+
+    write = ToFolder.write
 
 
 @pytest.mark.parametrize(
@@ -245,34 +304,25 @@ class Taken(ToFolder):
         (Changing, "a second import differs"),
         (Untyped, "untyped has no type"),
         (NoTraining, "nothing is there to train on"),
-    ],
-)
-def test_flaws_of_importers_are_found(flawed, reason):
-    assert reason in failures(check_dataset_importer(flawed)).values()
-
-
-@pytest.mark.parametrize(
-    ("flawed", "reason"),
-    [
+        (Everything, "an empty folder is said to be in this format"),
+        (Shy, "it does not know its own example"),
         (Nothing, "nothing is written"),
         (Numbered, "a second export differs"),
         (Taken, "out is an option of every format: call it otherwise"),
     ],
 )
-def test_flaws_of_exporters_are_found(flawed, reason):
-    assert reason in failures(check_dataset_exporter(flawed)).values()
+def test_flaws_are_found(flawed, reason):
+    assert reason in failures(check_format(flawed)).values()
 
 
-def test_a_format_that_does_not_come_back_is_found(third_party):
-    registry = catalog().registry("dataset_importer")
-    registry.add("raw", f"{__name__}:Folder")
-    assert [*failures(check_dataset_exporter("raw"))] == ["reads back"]
+def test_a_format_that_does_not_come_back_is_found():
+    assert [*failures(check_format(Strange))] == ["reads back"]
 
 
 def test_the_one_in_the_documents_conforms(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
     (code,) = [b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Npz" in b]
-    (tmp_path / "documented_importer.py").write_text(code)
+    (tmp_path / "documented_format.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    target = importlib.import_module("documented_importer").Npz
-    assert failures(check_dataset_importer(target)) == {}
+    target = importlib.import_module("documented_format").Npz
+    assert failures(check_format(target)) == {}

@@ -25,7 +25,7 @@ from acwm_core.untrusted import read_json
 from acwm_dream.rollout import _read_actions
 from acwm_experiment.steps import saved_steps
 from acwm_experiment.table import Experiment
-from acwm_formats.lerobot_import import LeRobot
+from acwm_formats.lerobot import LeRobot
 from acwm_severity.curves import SeverityCurve
 from tests.trust.mutating import changed, damaged, dumped, survives
 
@@ -164,7 +164,7 @@ def lerobot(folder, seed):
         file.write_bytes(dumped(changed(json.loads(file.read_bytes()), seed)))
     else:
         file.write_bytes(damaged(file.read_bytes(), seed))
-    found = LeRobot(root).read()
+    found = LeRobot().read(root)
     for recordings in found.splits.values():
         recordings[0]
 

@@ -1,4 +1,4 @@
-"""Import of LeRobot datasets: the frames of one camera, actions and observed numbers."""
+"""The format of LeRobot: the frames of one camera, actions and observed numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hashlib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from acwm_core.data.formats import DatasetImporter, import_command
-from acwm_core.data.recordings import RecordedDataset, Recording, recorded_card
-from acwm_core.env.environment import ActionSpec, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, suggest
 from acwm_formats.example import exported_example
-from acwm_formats.lerobot_export import LeRobotExporter
+from acwm_formats.format import Export, Format, import_command
+from acwm_formats.lerobot_export import Writer
 from acwm_formats.lerobot_layout import (
     ACTION,
     INFO,
@@ -33,6 +32,7 @@ from acwm_formats.lerobot_layout import (
     read_info,
     read_places,
 )
+from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
 from acwm_formats.video import shrunk, target_size, video_facts, video_frames
 
 TESTS: dict[str, Split] = {
@@ -43,81 +43,109 @@ TESTS: dict[str, Split] = {
 """Splits of ``meta/info.json`` that are kept as test splits; all others become training data."""
 
 
-@dataclass(frozen=True)
-class LeRobot(DatasetImporter):
-    """Import the LeRobot dataset in the folder ROOT, of version 3.0 or 2.x.
+class LeRobot(Format):
+    """LeRobot datasets: 3.0 and 2.x are read, 3.0 is written."""
 
-    Imports the frames of one camera, the actions and the observed numbers, but not tasks and
-    rewards. The bounds of actions are the range of the data, since the format has none; if acwm
-    wrote the dataset, they come from its card.
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether there is a ``meta/info.json``."""
+        return (path / INFO).is_file()
 
-    Args:
-        root: the dataset's folder, with `meta`, `data` and `videos` in it.
-        camera: Which camera, e.g. observation.images.top; the first by default.
-        test_episodes: How many of the last episodes become ind_test; by default the dataset's own
-            test splits, or if it has none a tenth, at least two.
-        size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
-        environment: Name of the environment.
-    """
+    def read(
+        self,
+        root: Path,
+        *,
+        camera: str | None = None,
+        test_episodes: int | None = None,
+        size: int | tuple[int, int] | None = None,
+        environment: str | None = None,
+    ) -> RecordedDataset:
+        """Import the LeRobot dataset in the folder ROOT, of version 3.0 or 2.x.
 
-    root: Path
-    _: KW_ONLY
-    camera: str | None = None
-    test_episodes: int | None = None
-    size: int | tuple[int, int] | None = None
-    environment: str | None = None
+        Imports the frames of one camera, the actions and the observed numbers, but not tasks and
+        rewards. The bounds of actions are the range of the data, since the format has none; if acwm
+        wrote the dataset, they come from its card.
 
-    def read(self) -> RecordedDataset:
-        """Read the index of the dataset, and all actions for their range.
-
-        Raises:
-            DataError: a file is missing, damaged or of another version, or there is no camera or
-                no actions.
+        Args:
+            root: the dataset's folder, with `meta`, `data` and `videos` in it.
+            camera: Which camera, e.g. observation.images.top; the first by default.
+            test_episodes: How many of the last episodes become ind_test; by default the dataset's
+                own test splits, or if it has none a tenth, at least two.
+            size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
+            environment: Name of the environment.
         """
-        with as_one_sentence(Path(self.root)):
-            return self._read()
+        root, name = Path(root), Path(root).resolve().name
+        with as_one_sentence(root):
+            info = read_info(root)
+            features = cast(dict[str, dict[str, Any]], info["features"])
+            camera = _camera(features, camera)
+            places = read_places(root, camera)
+            if not places:
+                raise DataError(f"{root} holds no episodes")
+            card = _card(root, info, camera, places, size, environment)
+            splits = _splits(info, len(places), test_episodes)
+            options = {"camera": camera, "test_episodes": test_episodes}
+            options |= {"environment": environment, "size": card.frame_size}
+            facts = {"kind": "lerobot", "name": name}
+            facts["command"] = import_command("lerobot", name, **options)
+            names = tuple(field.name for field in card.state)
+            return RecordedDataset(
+                card,
+                {
+                    split: LeRobotRecordings(
+                        root, camera, numbers, info["fps"], card.frame_size, names
+                    )
+                    for split, numbers in splits.items()
+                },
+                {**facts, **_facts(root, places, splits)},
+                notes=_notes(info, features, camera, bounds=read_card(root) is None),
+                nominal={s: [places[i].length for i in numbers] for s, numbers in splits.items()},
+            )
 
-    def _read(self) -> RecordedDataset:
-        root, name = Path(self.root), Path(self.root).resolve().name
-        info = read_info(root)
-        features = cast(dict[str, dict[str, Any]], info["features"])
-        camera = _camera(features, self.camera)
-        places = read_places(root, camera)
-        if not places:
-            raise DataError(f"{root} holds no episodes")
-        state, ours = _state(features), read_card(root)
-        robot = f"{info.get('robot_type') or 'a robot'}, seen by {camera}"
-        called = ours.name if ours else re.sub(r"\W+", "_", name).strip("_").lower()
-        card = recorded_card(
-            self.environment or called or "imported",
-            ours.action if ours else _action(features, places),
-            frame_size=target_size(_frame_size(places[0], camera), self.size),
-            fps=max(1, round(info["fps"])),
-            horizon=max(place.length for place in places),
-            state=state,
-            summary=ours.summary if ours else robot,
-        )
-        names = tuple(field.name for field in state)
-        splits = _splits(info, len(places), self.test_episodes)
-        options = {"camera": camera, "test_episodes": self.test_episodes}
-        options |= {"environment": self.environment, "size": card.frame_size}
-        facts = {"kind": "lerobot", "name": name}
-        facts["command"] = import_command("lerobot", name, **options)
-        return RecordedDataset(
-            card,
-            {
-                split: LeRobotRecordings(root, camera, numbers, info["fps"], card.frame_size, names)
-                for split, numbers in splits.items()
-            },
-            {**facts, **_facts(root, places, splits)},
-            notes=_notes(info, features, camera, bounds=ours is None),
-            nominal={s: [places[i].length for i in numbers] for s, numbers in splits.items()},
-        )
+    def write(self, export: Export) -> None:
+        """Write a LeRobot dataset of version 3.0 with one camera.
+
+        Video is visually lossless, not bit-exact. The format cannot store masks, contacts and
+        factors. State fields of up to 64 numbers are joined to `observation.state`. Larger ones
+        become separate features, with statistics of the whole dataset but not of each episode.
+        `meta/acwm.json` keeps the environment's card, so that an import knows units and bounds.
+        """
+        writer = Writer(export.folder, export.card.environment)
+        splits: dict[str, str] = {}
+        for split in export.splits:
+            first = len(writer.episodes)
+            for episode in export.episodes(split):
+                writer.add(episode)
+            splits[split] = f"{first}:{len(writer.episodes)}"
+        writer.close(splits)
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """Options for an example dataset, made by the exporter."""
-        return {"root": exported_example(folder, LeRobotExporter()), "test_episodes": 1}
+        """An example dataset that `write` made."""
+        return {"root": exported_example(folder, cls()), "test_episodes": 1}
+
+
+def _card(
+    root: Path,
+    info: Mapping[str, Any],
+    camera: str,
+    places: Sequence[Place],
+    size: int | tuple[int, int] | None,
+    environment: str | None,
+) -> EnvironmentCard:
+    """What the recordings show; action and summary of acwm's own card, if it wrote the dataset."""
+    ours = read_card(root)
+    robot = f"{info.get('robot_type') or 'a robot'}, seen by {camera}"
+    folder = re.sub(r"\W+", "_", root.resolve().name).strip("_").lower()
+    return recorded_card(
+        environment or (ours.name if ours else folder) or "imported",
+        ours.action if ours else _action(info["features"], places),
+        frame_size=target_size(_frame_size(places[0], camera), size),
+        fps=max(1, round(info["fps"])),
+        horizon=max(place.length for place in places),
+        state=_state(info["features"]),
+        summary=ours.summary if ours else robot,
+    )
 
 
 @dataclass(frozen=True)

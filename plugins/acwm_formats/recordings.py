@@ -130,7 +130,7 @@ def import_dataset(
     one recording in memory at a time.
 
     Args:
-        recorded: what an importer read, e.g. ``LeRobot(root).read()``.
+        recorded: what a format read, e.g. ``LeRobot().read(root)``.
         workers: number of processes, one per core by default; 0 imports in this process.
 
     Returns:

@@ -1,0 +1,165 @@
+"""Formats of datasets: the interface that plugins implement, and how data is exported by it.
+
+A registered class becomes the commands ``acwm data import NAME`` and, if it can be written, ``acwm
+data export NAME``. The parameters of its `read` and `write` become arguments, and keyword-only ones
+options. Their help is the ``Args`` section of the method's docstring; the text above it is the
+command's description. Supported types are `str`, `int`, `float`, `bool`, `Path`, `Literal`,
+``tuple[int, ...]`` (comma-separated numbers) and ``int | tuple[int, int]`` (a frame size), each
+optionally with None.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from acwm_core.data.atomic import made_whole, writing
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.remote import data_folder
+from acwm_core.env.episode import Episode, Split
+from acwm_core.errors import DataError, MissingExtraError
+from acwm_core.executors import progress_bar
+from acwm_core.plugins import catalog
+from acwm_formats.recordings import RecordedDataset
+
+
+class Export(NamedTuple):
+    """What `Format.write` is given.
+
+    Attributes:
+        card: the card of the dataset.
+        splits: its splits.
+        folder: where to write; it exists and is empty.
+        advance: call it once per episode, for the progress bar.
+    """
+
+    card: DatasetCard
+    splits: dict[Split, EpisodeDataset]
+    folder: Path
+    advance: Callable[[], None]
+
+    def episodes(self, split: Split) -> Iterator[Episode]:
+        """Iterate over the episodes of a split; calls `advance` for each."""
+        for episode in self.splits[split]:
+            yield episode
+            self.advance()
+
+
+class Format(ABC):
+    """A format in which recordings are kept. A subclass reads it, writes it, or both."""
+
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether `path` is in this format, told by the names of its files or their first bytes."""
+        return False
+
+    def read(self, *source: Any, **options: Any) -> RecordedDataset | Mapping[str, RecordedDataset]:
+        """Return the dataset to import, or several, keyed by the subfolder of ``--out`` to fill.
+
+        Args:
+            source: what to read, usually the one path that `detect` knows.
+            options: keyword-only parameters of the subclass.
+
+        Raises:
+            DataError: something is missing, damaged or not in this format.
+        """
+        raise DataError(f"{type(self).__name__} can only be exported, not imported")
+
+    def write(self, export: Export, *args: Any, **options: Any) -> None:
+        """Write a whole dataset; an `OSError` is reported to the user in one sentence.
+
+        `read`, if there is one, must read what this writes, given the folder alone.
+        """
+        raise DataError(f"{type(self).__name__} can only be imported, not exported")
+
+    @classmethod
+    @abstractmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """Write a few short recordings into the empty `folder`; return parameters to read them.
+
+        The conformance suite imports these recordings. A format that is only written returns {}.
+        """
+
+    @classmethod
+    def reads(cls) -> bool:
+        """Whether it can be imported."""
+        return cls.read is not Format.read
+
+    @classmethod
+    def writes(cls) -> bool:
+        """Whether it can be exported."""
+        return cls.write is not Format.write
+
+
+def detected_format(path: Path) -> str:
+    """The name of the registered format that `path` is in.
+
+    Raises:
+        DataError: there is no such path, or no format or several know it.
+    """
+    if not path.exists():
+        raise DataError(f"there is no {path}, and no format of that name: see `acwm list format`")
+    found: list[str] = []
+    for component in catalog().registry("format"):
+        try:
+            if component.load().detect(path):
+                found.append(component.name)
+        except MissingExtraError:
+            continue  # it cannot be read here anyway
+    if len(found) == 1:
+        return found[0]
+    known = ", ".join(found or (each.name for each in catalog().registry("format")))
+    what = "is in several formats" if found else "is in no format that is known"
+    raise DataError(f"{path} {what}: give --format, one of {known}")
+
+
+def export_dataset(
+    data: str | Path, out: str | Path, target: Format, *, progress: bool = True, **options: Any
+) -> Path:
+    """Export the data folder `data` to the folder `out` in another format, whole or not at all.
+
+    Args:
+        target: the format.
+        options: keyword-only parameters of its `write`.
+
+    Returns:
+        The folder `out`.
+
+    Raises:
+        DataError: `data` is missing, unfinished or damaged; `out` exists already or cannot be
+            written.
+    """
+    data, out = data_folder(data), Path(out)
+    if out.exists():
+        raise DataError(f"{out} already exists: choose another --out, or delete it")
+    card = DatasetCard.read(data)
+    splits: dict[Split, EpisodeDataset] = {s: EpisodeDataset(data, s) for s in card.splits}
+    bar = progress_bar("exporting", sum(card.splits.values()), shown=progress)
+    with writing(out), made_whole(out) as partial, bar as report:
+        target.write(Export(card, splits, partial, lambda: report(1)), **options)
+    return out
+
+
+def import_command(kind: str, name: str, **options: object) -> str:
+    """The command ``acwm data import KIND NAME --option value …``; options of None are left out."""
+    words = ["acwm", "data", "import", kind, name]
+    for option, value in options.items():
+        if value is not None:
+            size = "x".join(map(str, cast(Any, value))) if isinstance(value, tuple) else value
+            words += [f"--{option.replace('_', '-')}", str(size)]
+    return shlex.join(words)
+
+
+def options_of(method: Callable[..., Any]) -> list[tuple[inspect.Parameter, str]]:
+    """The parameters that a user gives to `Format.read` or `write`, each with its text."""
+    parameters = inspect.signature(method, eval_str=True).parameters.values()
+    says = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(method) or "", re.M)
+    texts = {name: " ".join(text.split()) for name, text in says}
+    asked = (each for each in parameters if each.name not in ("self", "export"))
+    return [(parameter, texts.get(parameter.name, "")) for parameter in asked]
