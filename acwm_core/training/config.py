@@ -71,8 +71,9 @@ class TrainingConfig:
         activation_checkpointing: keep only the inputs of each layer and recompute its activations
             for the gradient: a third more computation, for much less memory.
         cpu_threads: threads for CPU arithmetic per process. By default that of OMP_NUM_THREADS; if
-            it is not set and one process trains on a CPU, the number that is fastest at the start.
-            The run's recipe stores that number, and a resumed run keeps it.
+            it is not set and one process trains on a CPU, one per core, or per idle core where
+            waiting threads cannot be made to sleep. The run's recipe stores that number, and a
+            resumed run keeps it.
         validate_every_n_steps: optimiser steps between validations.
         validation_rollouts: number of validation clips that are predicted at each validation, with
             at most 4 sampling steps, to log their similarity to the true ones; 0 for none.

@@ -58,10 +58,10 @@ def build_trainer(
         "use_distributed_sampler": False,  # the data module distributes the clips
         "enable_model_summary": False,
         "log_every_n_steps": 10,
-        "logger": _all_loggers(loggers, chosen.pop("logger", None)),
     }
-    added = chosen.pop("callbacks", None) or []
-    added: list[Callback] = [added] if isinstance(added, Callback) else added
+    if not isinstance(flags.get("logger"), bool):  # False: no loggers; True: Lightning's default
+        chosen["logger"] = [*loggers, *_listed(chosen.get("logger"))]
+    added: list[Callback] = _listed(chosen.pop("callbacks", None))
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
     strategy = chosen.get("strategy")
     others = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
@@ -73,8 +73,7 @@ def build_trainer(
             f"{name} shards the weights in a way that their moving average and checkpoints cannot "
             "follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
         )
-    given: Any = chosen.pop("plugins", None) or []
-    plugins: list[Any] = [*given] if isinstance(given, Sequence) else [given]
+    plugins = _listed(chosen.pop("plugins", None))
     if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
         plugins.append(CheckpointFiles())
     try:
@@ -117,10 +116,9 @@ def one_line(error: BaseException) -> str:
     return " ".join(message.split())
 
 
-def _all_loggers(ours: Sequence[Logger], given: Any) -> list[Logger] | bool:
-    if isinstance(given, bool):  # False: no loggers; True: Lightning's default
-        return given
-    return [*ours, *(given if isinstance(given, Sequence) else [given] if given else [])]
+def _listed(given: Any) -> list[Any]:
+    """The objects of a flag that takes one, several or none."""
+    return [*given] if isinstance(given, Sequence) else [given] if given else []
 
 
 def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:

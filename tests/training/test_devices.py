@@ -91,67 +91,92 @@ CONSTANT = {"schedule": "constant"}
 JOBS = {
     "ddp": two("ddp"),
     "fsdp": two("fsdp"),
-    "killed": two("fsdp", callbacks=[callback("Die", batch=10)]),
     "stopped": two("fsdp", callbacks=[callback("Signal", batch=9, rank=1)]),
+    "poisoned": two("fsdp", callbacks=[callback("Poison", batch=5, rank=1)]),
+}
+"""Recipes of runs in two processes, all of which take 4 clips per step."""
+
+MORE_JOBS = {
+    "killed": two("fsdp", callbacks=[callback("Die", batch=10)]),
     "recomputed": two(
         "fsdp", 1, accumulate_grad_batches=2, training={"activation_checkpointing": True}
     ),
     "scattered": two("fsdp", 1, accumulate_grad_batches=2, training=CONSTANT),
     "gathered": two("fsdp", max_steps=7, training=CONSTANT),
-    "poisoned": two("fsdp", callbacks=[callback("Poison", batch=5, rank=1)]),
 }
-"""Recipes of runs in two processes, all of which take 4 clips per step."""
+"""More of them, for `make test-all`."""
+
+
+def job(runs, name, *, resume=False, weighed=False):
+    """A job of `train_many`; a resumed one is spared what stopped it."""
+    path, words = runs[name].path, {**JOBS, **MORE_JOBS}[name]
+    if weighed:
+        folder = path.with_name(f"memory-{name}")
+        folder.mkdir()
+        weigh = callback("Weigh", folder=str(folder))
+        words = {**words, "trainer": {**words["trainer"], "callbacks": [weigh]}}
+    resumed = str(path) if resume else None
+    return {"run": str(path), "sections": words, "resume": resumed, "spared": resume}
+
+
+def outcomes(data, jobs):
+    (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
+    assert (first.returncode, second.returncode) == (0, 0), errors + others
+    return json.loads(printed.splitlines()[-1])
 
 
 @pytest.fixture(scope="module")
 def runs(data, tmp_path_factory):
-    """Runs by name: `one` and `constant` by one device, and those of `JOBS`, finished.
-
-    `scattered` was begun by one device; `gathered` is begun by two and ends after 7 steps.
-    """
+    """Runs by name: `one` by one device, and those of `JOBS`, finished but for the last."""
     folder = tmp_path_factory.mktemp("runs")
-    made = {name: RunFolder(folder / name) for name in ("one", "constant", *JOBS)}
+    made = {name: RunFolder(folder / name) for name in ("one", "constant", *JOBS, *MORE_JOBS)}
     fit(tiny_recipe(data, **sections(4)), made["one"].path)
-    fit(tiny_recipe(data, **sections(4, training=CONSTANT)), made["constant"].path)
-    begun = sections(4, max_steps=7, training=CONSTANT)
-    fit(tiny_recipe(data, **begun), made["scattered"].path)
-
-    def job(name, *, resume=False):
-        path = str(made[name].path)
-        return {"run": path, "sections": JOBS[name], "resume": path if resume else None}
-
-    killed = in_two_processes(data, [job("killed")])
-    assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
-    jobs = [job("ddp"), job("fsdp"), job("killed", resume=True), job("stopped")]
-    jobs += [job("stopped", resume=True), job("recomputed"), job("scattered", resume=True)]
-    jobs += [job("gathered"), job("poisoned")]
-    for weighed in ("ddp", "fsdp"):
-        (folder / f"memory-{weighed}").mkdir()
-        (found,) = [job for job in jobs if job["run"].endswith(f"/{weighed}")]
-        weigh = callback("Weigh", folder=str(folder / f"memory-{weighed}"))
-        trainer = {**found["sections"]["trainer"], "callbacks": [weigh]}
-        found["sections"] = {**found["sections"], "trainer": trainer}
-    for resumed in jobs:
-        resumed["spared"] = resumed["resume"] is not None
-    (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
-    assert (first.returncode, second.returncode) == (0, 0), errors + others
-    outcomes = json.loads(printed.splitlines()[-1])
+    jobs = [job(made, name, weighed=True) for name in ("ddp", "fsdp")]
+    jobs += [job(made, "stopped"), job(made, "stopped", resume=True), job(made, "poisoned")]
+    *others, poisoned = outcomes(data, jobs)
     stopped = f"75: stopped by SIGTERM, saved step 10; continue with resume={made['stopped'].path}"
-    assert outcomes[:-1] == [None] * 3 + [stopped] + [None] * 4
-    assert outcomes[-1].startswith("2: the loss or its gradient is not finite in step 5 (")
+    assert others == [None, None, stopped, None]
+    assert poisoned.startswith("2: the loss or its gradient is not finite in step 5 (")
     return made
 
 
-@pytest.mark.parametrize("name", ["ddp", "fsdp", "recomputed"])
+@pytest.fixture(scope="module")
+def more_runs(runs, data):
+    """With `constant` by one device, and those of `MORE_JOBS`.
+
+    `scattered` was begun by one device; `gathered` is begun by two and ends after 7 steps.
+    """
+    fit(tiny_recipe(data, **sections(4, training=CONSTANT)), runs["constant"].path)
+    begun = sections(4, max_steps=7, training=CONSTANT)
+    fit(tiny_recipe(data, **begun), runs["scattered"].path)
+    killed = in_two_processes(data, [job(runs, "killed")])
+    assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
+    jobs = [job(runs, name, resume=True) for name in ("killed", "scattered")]
+    jobs += [job(runs, name) for name in ("recomputed", "gathered")]
+    assert outcomes(data, jobs) == [None] * 4
+    return runs
+
+
+@pytest.mark.parametrize("name", ["ddp", "fsdp"])
 def test_two_processes_train_as_one(name, runs):
-    """Weights, averages and all that is logged, also when layers are computed again."""
+    """Weights, averages and all that is logged."""
     assert_close(runs["one"], runs[name])
 
 
-@pytest.mark.parametrize("name", ["killed", "stopped"])
-def test_sharded_runs_resume_exactly(name, runs):
-    """After SIGKILL in both, and after a SIGTERM that one of the two received."""
-    assert_same(runs["fsdp"], runs[name])
+@pytest.mark.slow
+def test_layers_that_are_computed_again_train_the_same(more_runs):
+    assert_close(more_runs["one"], more_runs["recomputed"])
+
+
+def test_sharded_runs_resume_exactly(runs):
+    """After a SIGTERM that one of the two received."""
+    assert_same(runs["fsdp"], runs["stopped"])
+
+
+@pytest.mark.slow
+def test_killed_sharded_runs_resume_exactly(more_runs):
+    """After SIGKILL in both."""
+    assert_same(more_runs["fsdp"], more_runs["killed"])
 
 
 @pytest.mark.parametrize(("name", "parts"), [("ddp", 1), ("fsdp", 2)])
@@ -195,8 +220,10 @@ def test_the_saved_model_is_one_file_of_the_averages(runs):
     ]
 
 
-def test_a_run_moves_to_other_devices(runs, data):
+@pytest.mark.slow
+def test_a_run_moves_to_other_devices(more_runs, data):
     """From one to two with sharded weights and smaller batches, and from two to one."""
+    runs = more_runs
     assert_close(runs["constant"], runs["scattered"])
     whole = sections(4, training=CONSTANT)
     moved = runs["gathered"]

@@ -85,7 +85,7 @@ def test_latents_that_are_cut_off_under_a_training_are_one_sentence(workers, dat
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("batch", [1, 4])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_a_worker_that_is_killed_is_one_sentence(batch, data, tmp_path, monkeypatch):
     kill = {"class_path": "tests.training.faults.KillWorker", "init_args": {"batch": batch}}
     recipe = tiny_recipe(data, data={"workers": 1}, trainer={"callbacks": [kill]})

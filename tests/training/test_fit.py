@@ -136,9 +136,11 @@ def test_validations_rollouts_leave_the_weights_alone(whole, data, tmp_path):
     assert all(torch.equal(value, ours[name]) for name, value in weights(whole).items())
 
 
-@pytest.mark.parametrize("batches", [[3], [5, 11], [8], [12], [15]])
+@pytest.mark.parametrize(
+    "batches", [[5, 11], *(pytest.param([n], marks=pytest.mark.slow) for n in (3, 8, 12, 15))]
+)
 def test_a_killed_run_resumes_on_the_same_curve(batches, whole, data, tmp_path, monkeypatch):
-    """Killed after a checkpoint, between two, twice, after a validation, and near the end."""
+    """Killed twice; after a checkpoint, after a validation, between two, and near the end."""
     run = RunFolder(tmp_path / "run")
     for batch in batches:
         monkeypatch.setattr(Kill, "batch", batch)
@@ -151,7 +153,7 @@ def test_a_killed_run_resumes_on_the_same_curve(batches, whole, data, tmp_path, 
     assert not (tmp_path / "unused").exists()
 
 
-@pytest.mark.parametrize("every", [3, 4])
+@pytest.mark.parametrize("every", [pytest.param(3, marks=pytest.mark.slow), 4])
 def test_a_run_killed_in_validation_resumes_on_the_same_curve(
     every, whole, data, tmp_path, monkeypatch
 ):
@@ -167,15 +169,20 @@ def test_a_run_killed_in_validation_resumes_on_the_same_curve(
 @pytest.mark.parametrize(
     "changed",
     [
-        {"data": {"cache_latents": False}},
         {"trainer": {"accumulate_grad_batches": 2}},
-        pytest.param({"data": {"workers": 1}}, marks=pytest.mark.slow),
-        {"training": {"schedule": "constant", "ema_decay": 0.0}},
-        {"trainer": {"precision": "bf16-mixed"}},
-        {"data": {"validation_episodes": 0}},
-        pytest.param({"training": {"compile": True}}, marks=pytest.mark.slow),
+        *(
+            pytest.param(changed, marks=pytest.mark.slow)
+            for changed in (
+                {"data": {"cache_latents": False}},
+                {"data": {"workers": 1}},
+                {"training": {"schedule": "constant", "ema_decay": 0.0}},
+                {"trainer": {"precision": "bf16-mixed"}},
+                {"data": {"validation_episodes": 0}},
+                {"training": {"compile": True}},
+            )
+        ),
     ],
-    ids=["video", "accumulated", "worker", "constant", "bfloat16", "unvalidated", "compiled"],
+    ids=["accumulated", "video", "worker", "constant", "bfloat16", "unvalidated", "compiled"],
 )
 def test_resuming_is_exact_for_other_recipes(changed, data, tmp_path, monkeypatch):
     whole = RunFolder(fit(killable(data, **changed), tmp_path / "whole"))

@@ -70,9 +70,9 @@ def without_validation(run, step):
     }
 
 
-@pytest.mark.parametrize("batch", [6, 7, 9])
+@pytest.mark.parametrize("batch", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 9))])
 def test_a_step_is_finished_saved_and_gone_on_from(batch, whole, data, tmp_path, again):
-    """Between two checkpoints, in the step before a validation, and right after one."""
+    """In the step before a validation, between two checkpoints, and right after one."""
     run = RunFolder(tmp_path / "run")
     with pytest.raises(StoppedEarly) as stopped:
         fit(signalled(data, batch=batch), run.path, resume="auto")
@@ -99,7 +99,7 @@ def test_ctrl_c_saves_the_step_and_its_advice_is_true(whole, data, tmp_path, aga
     assert_same(whole, run)
 
 
-@pytest.mark.parametrize("batch", [1, 7])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_a_second_ctrl_c_does_not_wait(batch, whole, data, tmp_path, again):
     init_args = {"batch": batch, "number": int(signal.SIGINT)}
     twice = [{"class_path": "tests.training.tiny.Signal", "init_args": init_args}] * 2
@@ -140,7 +140,7 @@ def test_a_run_that_is_to_stop_finishes_its_step(data, tmp_path, again):
     assert numbers(RunFolder(again(recipe, tmp_path / "whole"))) == without_validation(run, 4)
 
 
-@pytest.mark.parametrize("array", [False, True])
+@pytest.mark.parametrize("array", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_slurm_queues_the_job_again(array, whole, data, tmp_path, slurm, again, monkeypatch):
     if array:
         monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "77")

@@ -17,6 +17,7 @@ from tests.training.tiny import Kill, Killed, tiny_recipe
 def asked(monkeypatch):
     """How often idle cores were counted; there is one, or none."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     calls = []
     monkeypatch.setattr("acwm_core.training.fit.idle_cores", lambda: calls.append(1) or 0.4)
     return calls
@@ -46,6 +47,14 @@ def test_a_run_keeps_the_number_with_which_it_began(data, tmp_path, monkeypatch,
     torch.set_num_threads(2)
     fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
     assert len(asked) == recorded(tmp_path / "run") == torch.get_num_threads() == 1
+
+
+def test_threads_that_sleep_are_not_spared(data, tmp_path, monkeypatch, asked):
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    torch.set_num_threads(2)
+    fit(recipe_of(data), tmp_path / "run")
+    assert asked == []
+    assert recorded(tmp_path / "run") == 2
 
 
 def test_what_the_user_says_wins(data, tmp_path, monkeypatch, asked):
