@@ -55,17 +55,8 @@ KINDS = {
 }
 """Core's kinds of component: what a target is, and in a phrase. Plugins add kinds of their own."""
 
-CHECKED = [
-    "environment",
-    "codec",
-    "model",
-    "conditioner",
-    "objective",
-    "metric",
-    "estimator",
-    "task",
-]
-"""Those of them with a conformance suite ``acwm_core.checks.check_KIND``."""
+UNCHECKED = ("executor", "protocol", "trained_model", "command")
+"""Those without a conformance suite; all others have one, ``acwm_core.checks.check_KIND``."""
 
 OWN = {
     "objective": {
@@ -274,9 +265,9 @@ class Registry:
         if name in self._components:
             owner = self._components[name].plugin
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
-        about = self._plugin, self._distribution, summary, extra, requires, defaults, physics
         self._components[name] = Component(
-            self.kind, name, target, *about, dict(tasks or {}), objective
+            *(self.kind, name, target, self._plugin, self._distribution, summary, extra, requires),
+            *(defaults, physics, dict(tasks or {}), objective),
         )
 
     def include(self, component: Component) -> None:
@@ -351,7 +342,7 @@ class Catalog:
         self._manager = pluggy.PluginManager(PROJECT)
         self._open("kind")
         for kind, (target, summary) in KINDS.items():
-            check = f"acwm_core.checks:check_{kind}" if kind in CHECKED else ""
+            check = "" if kind in UNCHECKED else f"acwm_core.checks:check_{kind}"
             self.registry("kind").add(kind, target, summary=summary, check=check)
             self._open(kind)
         for kind, components in OWN.items():
@@ -419,12 +410,7 @@ class Catalog:
         for registry in self._registries.values():
             registry.registering(name, distribution)
         try:
-            self._manager.register(plugin, name)
-            for kind in self._registries["kind"].components().keys() - self._registries.keys():
-                self._open(kind, name, distribution)
-            self._manager.check_pending()  # raises for a misspelt hook
-            if not self._manager.get_hookcallers(plugin):
-                raise PluginError("it implements no hook: mark its functions with @hookimpl")
+            self._register(plugin, name, distribution)
         except BaseException:
             if self._manager.has_plugin(name):
                 self._manager.unregister(name=name)
@@ -433,6 +419,16 @@ class Catalog:
             raise
         self.plugins.append(name)
         self._share_tasks()
+
+    def _register(self, plugin: object, name: str, distribution: str | None) -> None:
+        """Let the hooks of a plugin add its components, also those of kinds that it adds itself."""
+        self._manager.register(plugin, name)
+        for kind in self._registries["kind"].components():
+            if kind not in self._registries:
+                self._open(kind, name, distribution)
+        self._manager.check_pending()  # raises for a misspelt hook
+        if not self._manager.get_hookcallers(plugin):
+            raise PluginError("it implements no hook: mark its functions with @hookimpl")
 
     def _share_tasks(self) -> None:
         """Give environments the tasks that others registered for them, and register their own."""

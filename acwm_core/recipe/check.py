@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping
 from pkgutil import resolve_name
 from typing import Any, cast
 
-from acwm_core.env.environment import Environment
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
@@ -114,7 +113,7 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
     component, params = _component(section, choice)
     inherited = params.pop(INHERITED, {})
     values = {**component.defaults, **params}
-    takes = signature(Environment)
+    takes = signature(resolve_name("acwm_core.env.environment:Environment"))
     if section != "env" or values.keys() - takes.parameters:
         takes = _signature_of(component)
     shared = {name: value for name, value in inherited.items() if name in takes.parameters}
