@@ -16,6 +16,7 @@ from acwm_core.checks.environment import EnvironmentChecks
 from acwm_core.checks.estimator import EstimatorChecks
 from acwm_core.checks.metric import MetricChecks
 from acwm_core.checks.model import check_model
+from acwm_core.checks.objective import ObjectiveChecks
 from acwm_core.checks.result import CheckResult
 from acwm_core.checks.task import check_task
 
@@ -24,6 +25,7 @@ check_conditioner = ConditionerChecks.check
 check_environment = EnvironmentChecks.check
 check_estimator = EstimatorChecks.check
 check_metric = MetricChecks.check
+check_objective = ObjectiveChecks.check
 
 __all__ = [
     "CheckResult",
@@ -33,5 +35,6 @@ __all__ = [
     "check_estimator",
     "check_metric",
     "check_model",
+    "check_objective",
     "check_task",
 ]

@@ -9,6 +9,7 @@ from tests.checks import (
     test_importers,
     test_metrics,
     test_models,
+    test_objectives,
     test_planners,
 )
 from tests.checks.results import failures, in_words
@@ -20,6 +21,7 @@ MODULES = (
     test_importers,
     test_metrics,
     test_models,
+    test_objectives,
     test_planners,
 )
 SUITES = [*(module.FLAWS for module in MODULES), test_metrics.SET_FLAWS]

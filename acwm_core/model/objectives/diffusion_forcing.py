@@ -63,12 +63,15 @@ class _DenoisedStream(LatentStream):
         done = self._unkept.shape[1]
         alone = conditioning.frames(done, done + 1)
 
+        def extend(noisy: Latent, sigma: Sigmas, actions: Conditioning) -> Latent:
+            inputs = self._objective.sampling_inputs(sigma, self._steps)
+            return self._model.extend(noisy, sigma, actions, self._cache, **inputs)
+
         def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
             if self._unkept is None:
-                return self._model.extend(noisy, sigma, alone, self._cache)
+                return extend(noisy, sigma, alone)
             pair = torch.cat([self._unkept, noisy], 1)
-            level = functional.pad(sigma, (done, 0))
-            predicted = self._model.extend(pair, level, conditioning, self._cache)
+            predicted = extend(pair, functional.pad(sigma, (done, 0)), conditioning)
             self._cache.keep(done)
             self._unkept = None
             return predicted[:, done:]

@@ -125,7 +125,16 @@ class FlowMatching(Objective[Denoiser]):
     ) -> Latent:
         """Sample all frames together; see `Objective.predict`."""
         noise = drawn_noise((frames, *given.shape[2:]), generators).to(given)
-        return self.sample(evaluation(model, conditioning), noise, given, steps)
+
+        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
+            inputs = self.sampling_inputs(sigma, steps)
+            return evaluation(model, conditioning, **inputs)(noisy, sigma)
+
+        return self.sample(evaluate, noise, given, steps)
+
+    def sampling_inputs(self, sigma: Sigmas, steps: int | None) -> dict[str, Tensor]:
+        """The further inputs of an evaluation in `steps` sampling steps, at levels `[B, L]`."""
+        return {}
 
     def draw(self, frames: int, generator: torch.Generator) -> Tensor:
         """Draw points of the training schedule for the `frames` latent frames after given ones."""

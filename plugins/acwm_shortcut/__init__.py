@@ -1,0 +1,1 @@
+"""Shortcut forcing: an objective whose models sample in few steps."""
