@@ -170,8 +170,8 @@ def save(
     Raises:
         AcwmError: the folder already holds a run.
     """
-    from acwm_core.data.atomic import written_whole
     from acwm_core.errors import TrainingError
+    from acwm_core.files import written_whole
     from acwm_core.training.run import RunFolder, save_weights  # imports torch
 
     run = RunFolder(path)

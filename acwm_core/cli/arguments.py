@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
-from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError, suggest
+from acwm_core.files import writable
 from acwm_core.renamed import with_new_names
 
 FOLDER = click.Path(path_type=Path)

@@ -19,12 +19,11 @@ from acwm_core.cli.components import check, list_components, show
 from acwm_core.cli.doctor import doctor
 from acwm_core.cli.fit import fit
 from acwm_core.cli.generate import generate
-from acwm_core.data.atomic import disk_error
 from acwm_core.errors import AcwmError, AcwmWarning, is_for_users, noting, sentence, suggest
+from acwm_core.files import disk_error
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.plugins import catalog
 from acwm_core.renamed import RenamedWarning
-from acwm_core.untrusted import printable
 
 
 class AcwmGroup(click.Group):
@@ -147,13 +146,13 @@ def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
     if issubclass(category, (AcwmWarning, RenamedWarning)):
-        click.echo(f"acwm: warning: {printable(str(message))}", err=True)
+        click.echo(f"acwm: warning: {message!s}", err=True)
     else:
         _show_any_warning(message, category, *more, **extra)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
-    click.echo(f"acwm: {printable(' '.join(message.split()))}", err=True)
+    click.echo(f"acwm: {' '.join(message.split())}", err=True)
     sys.exit(exit_code)
 
 

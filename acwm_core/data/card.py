@@ -14,12 +14,11 @@ from typing import Any, cast
 
 import yaml
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
+from acwm_core.files import check_inside, typed, written_whole
 from acwm_core.recipe.recipe import flat_items
-from acwm_core.untrusted import MAX_YAML, PlainLoader, check_folder, read_bytes, typed
 
 CARD, MANIFEST = "card.yaml", "manifest.jsonl"
 """The files of a data folder, and of each split in it."""
@@ -132,17 +131,14 @@ class DatasetCard:
         path = Path(path)
         file = path if path.suffix == ".yaml" else path / CARD
         if file != path and path.is_dir():
-            check_folder(path)
+            check_inside(path, *OWN)
         if not file.exists():
             raise DataError(
                 f"there is no dataset in {file.parent}: make one with "
                 f"`acwm generate ENVIRONMENT --out {file.parent}`"
             )
         try:
-            if file.stat().st_size > MAX_YAML:
-                raise ValueError(f"it has {file.stat().st_size} bytes")
-            text = read_bytes(file).decode()
-            values = cast(dict[str, Any], yaml.load(text, PlainLoader))
+            values = cast(dict[str, Any], yaml.safe_load(file.read_text(encoding="utf-8")))
             version = values["format"]
             if version == FORMAT:
                 return cls.from_dict(values)

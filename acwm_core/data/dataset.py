@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import MANIFEST, DatasetCard
 from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import ShardReader, ShardRecord, open_shard
 from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError
-from acwm_core.untrusted import read_bytes
+from acwm_core.files import written_whole
 
 
 class Manifest:
@@ -41,7 +40,7 @@ class Manifest:
     def __init__(self, folder: Path, episodes: int | None = None) -> None:
         self.path = folder / MANIFEST
         self.records: dict[str, ShardRecord] = {}
-        text = read_bytes(self.path) if self.path.exists() else b""
+        text = self.path.read_bytes() if self.path.exists() else b""
         lines = text.decode("utf-8", errors="replace").split("\n")  # damaged bytes fail below
         for line in lines[:-1]:
             try:

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.atomic import LOCK, held, remove_partial, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
@@ -28,6 +27,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
 from acwm_core.executors import Executor, LocalExecutor, progress_bar
+from acwm_core.files import LOCK, held, remove_partial, writing
 from acwm_core.plugins import catalog
 
 SHARD_EPISODES = 32

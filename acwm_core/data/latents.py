@@ -25,13 +25,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.data.atomic import alone, writing, written_whole
 from acwm_core.data.clips import Clips, common_length, padded_video, window_actions, window_starts
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, noting
 from acwm_core.executors import Report, progress_bar
+from acwm_core.files import alone, parse_json, writing, written_whole
 from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
-from acwm_core.untrusted import parse_json, read_bytes
 
 LATENTS = "latents"
 CARD = "latents.json"
@@ -93,7 +92,7 @@ class LatentFolder:
             with written_whole(file) as partial:
                 partial.write_text(json.dumps(card, indent=1), "utf-8")
         try:
-            there = parse_json(read_bytes(file))
+            there = parse_json(file.read_bytes())
         except ValueError:
             there = None
         if there != card:

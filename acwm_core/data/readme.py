@@ -7,10 +7,9 @@ from typing import Any, cast
 
 import yaml
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import Manifest
-from acwm_core.untrusted import read_bytes
+from acwm_core.files import written_whole
 
 README = "README.md"
 MARK = "<!-- Made by acwm from card.yaml. Without this line acwm leaves the page as it is. -->"
@@ -30,7 +29,7 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
         return str(text).replace("|", "\\|").replace("\n", " ")
 
     path = folder / README
-    if path.exists() and MARK.encode() not in read_bytes(path):
+    if path.exists() and MARK.encode() not in path.read_bytes():
         return
     pages = jinja2.Environment(
         loader=jinja2.PackageLoader("acwm_core.data", "."),

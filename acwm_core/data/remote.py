@@ -18,11 +18,10 @@ from typing import Any, cast
 
 import platformdirs
 
-from acwm_core.data.atomic import OF_THE_DISK, alone, written_whole
 from acwm_core.data.card import CARD, MANIFEST, DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, MissingExtraError
-from acwm_core.untrusted import read_bytes
+from acwm_core.files import OF_THE_DISK, alone, written_whole
 
 CACHE = "ACWM_CACHE"
 """Environment variable for the cache folder; the default is ``acwm`` in the user's cache folder."""
@@ -97,7 +96,7 @@ def _kept(url: str, fresh: Path, cache: Path) -> Path:
 def origin(folder: Path) -> str | None:
     """The URL that a folder of the cache was fetched from; None for any other folder."""
     file = folder / ORIGIN
-    return read_bytes(file).decode() if file.exists() else None
+    return file.read_bytes().decode() if file.exists() else None
 
 
 def fetch_shard(url: str, path: Path, sha256: str) -> None:

@@ -25,11 +25,10 @@ from typing import IO, Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.video import decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import DamagedShardError, DataError
-from acwm_core.untrusted import parse_json, typed
+from acwm_core.files import parse_json, typed, written_whole
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 SHARD = re.compile(r"shard-\d{5,9}\.tar")

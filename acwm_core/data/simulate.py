@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import ShardRecord, open_shard, write_shard
 from acwm_core.env.card import check_episode
@@ -33,6 +32,7 @@ from acwm_core.errors import (
     noting,
 )
 from acwm_core.executors import Report
+from acwm_core.files import writing
 from acwm_core.plugins import Component, catalog
 
 EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]

@@ -20,8 +20,8 @@ from av.codec.context import Flags
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError, ShapeError
+from acwm_core.files import written_whole
 
 # x264 does not guarantee that decisions of its lookahead are reproducible.
 REPEATABLE = {"bf": "0", "weightp": "0", "sc_threshold": "0", "rc-lookahead": "0"}

@@ -13,7 +13,6 @@ from typing import cast
 
 import torch
 
-from acwm_core.data.atomic import held, writing, written_whole
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.remote import data_folder
@@ -39,6 +38,7 @@ from acwm_core.evaluation.storage import (
 )
 from acwm_core.evaluation.summarise import gap, summarise_split
 from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip, magnification
+from acwm_core.files import held, writing, written_whole
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import run_to_write

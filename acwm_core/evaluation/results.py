@@ -8,14 +8,13 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
 from acwm_core.evaluation.benchmark import Published
 from acwm_core.evaluation.metric import MetricInfo as MetricInfo
 from acwm_core.evaluation.statistics import Estimate as Estimate
 from acwm_core.evaluation.statistics import Paired as Paired
 from acwm_core.evaluation.statistics import defined as defined
-from acwm_core.untrusted import check_folder, read_json
+from acwm_core.files import check_inside, read_json, written_whole
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -284,7 +283,7 @@ class Summary:
         Raises:
             DataError: the run was not evaluated, or with another version of acwm.
         """
-        check_folder(run)
+        check_inside(run, f"{FOLDER}/**/*")
         try:
             return cls.load(run / FOLDER / SUMMARY)
         except (FileNotFoundError, NotADirectoryError):

@@ -14,13 +14,12 @@ from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score
+from acwm_core.files import parse_json, written_whole
 from acwm_core.recipe.compose import RENAMED
-from acwm_core.untrusted import parse_json, read_bytes
 
 pa: Any = importlib.import_module("pyarrow")  # it has no type stubs
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -120,7 +119,7 @@ def refuse_other_result(
         DataError: settings or data differ; the message says how.
     """
     try:
-        facts = parse_json(read_bytes(file))["provenance"]
+        facts = parse_json(file.read_bytes())["provenance"]
         settings: dict[str, Any] = facts["evaluation"]
         there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
         checksums = dict[str, str](facts["dataset"]["checksums"])

@@ -11,7 +11,6 @@ from acwm_core.plugins import catalog
 from acwm_core.recipe.objective import INHERITED, chosen, inherited, with_current_sections
 from acwm_core.recipe.text import parse
 from acwm_core.renamed import with_new_names
-from acwm_core.untrusted import MAX_YAML, read_bytes
 
 OVERLAYS = "overlays"
 """Folder in which ``+NAME`` is looked up: beside the recipe, then among packaged recipes."""
@@ -135,7 +134,7 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        text = read_bytes(path, MAX_YAML).decode()
+        text = path.read_bytes().decode()
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise RecipeError(f"cannot read the recipe {path}: {error}") from error
     content: Any = parse(text, str(path)) or {}

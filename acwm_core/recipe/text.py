@@ -8,7 +8,6 @@ from typing import Any
 import yaml
 
 from acwm_core.errors import RecipeError
-from acwm_core.untrusted import PlainLoader, printable
 
 
 def parse(text: str, origin: str) -> Any:
@@ -26,11 +25,9 @@ def parse(text: str, origin: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
-        raise RecipeError(
-            f"{origin}{line} is not valid YAML: {printable(str(error.problem))}"
-        ) from error
-    except yaml.YAMLError as error:  # e.g. a number of 5,000 digits
-        why = printable(str(error)).splitlines()[0]
+        raise RecipeError(f"{origin}{line} is not valid YAML: {error.problem!s}") from error
+    except (yaml.YAMLError, ValueError) as error:  # e.g. a number of 5,000 digits
+        why = str(error).splitlines()[0]
         raise RecipeError(f"{origin} is not valid YAML: {why}") from error
 
 
@@ -39,7 +36,7 @@ def dump(values: dict[str, Any]) -> str:
     return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-class _Loader(PlainLoader):
+class _Loader(yaml.SafeLoader):
     pass
 
 

@@ -19,8 +19,8 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.errors import TrainingError
+from acwm_core.files import written_whole
 from acwm_core.model.shapes import Video
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import gradient_norm, total_norm

@@ -17,8 +17,8 @@ from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from acwm_core.data.atomic import disk_error, written_whole
 from acwm_core.errors import MissingExtraError
+from acwm_core.files import disk_error, written_whole
 from acwm_core.training.config import LOGGERS, chosen_loggers
 from acwm_core.training.run import RunFolder
 

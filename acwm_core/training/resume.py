@@ -10,12 +10,12 @@ from typing import Any, cast
 import lightning as L
 from lightning.pytorch.utilities import rank_zero_only
 
-from acwm_core.data.atomic import held, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import TrainingError
+from acwm_core.files import check_inside, held, written_whole
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.checkpoints import check_sums, last_whole, read_details
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import OWN, RunFolder, read_metadata
 from acwm_core.training.signals import StoppedEarly
 
 AUTO = "auto"
@@ -35,6 +35,7 @@ def checkpoint_to_resume(
     The first process refuses a folder that holds another run, or a run that this recipe and data
     cannot resume; the folder is in use by the time Lightning starts the others.
     """
+    check_inside(run.path, *OWN)
     last = last_whole(run.last_checkpoint)
     if not is_first_process():
         return None if resume is None else last

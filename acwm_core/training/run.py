@@ -13,10 +13,10 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
+from acwm_core.files import check_inside, written_whole
 from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite
 from acwm_core.model.world_model import WorldModel
@@ -29,6 +29,17 @@ FORMAT = 1
 
 TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
+
+
+OWN = (
+    *("recipe.yaml", "card.yaml", "*.safetensors", "metrics.csv", "README.md"),
+    *(
+        f"{folder}{rest}"
+        for folder in ("checkpoints", "samples", "evaluation", "planning")
+        for rest in ("", "/**/*")
+    ),
+)
+"""Patterns of acwm's own files in a run folder; loggers such as wandb write others."""
 
 
 class RunFolder:
@@ -82,6 +93,7 @@ def load_run(path: Path | str) -> RunBundle:
             f"{folder.path} has no trained weights yet: its training stopped before the first "
             "checkpoint"
         )
+    check_inside(folder.path, *OWN)
     recipe = Recipe.from_yaml(folder.recipe)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)

@@ -7,8 +7,8 @@ import inspect
 import shutil
 from pathlib import Path
 
-from acwm_core.data.atomic import alone, made_whole, writing
 from acwm_core.errors import TrainingError
+from acwm_core.files import alone, made_whole, writing
 from acwm_core.plugins import catalog
 
 COPIES = Path("runs", "trained")

@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
+from acwm_core.files import parse_json
 from acwm_core.model.shapes import check_finite
-from acwm_core.untrusted import parse_json, read_bytes
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
 SUBFOLDER = "vae"
@@ -42,7 +42,7 @@ def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoe
     local = Path(weights)
     folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
     try:
-        configuration: Any = parse_json(read_bytes(folder / CONFIGURATION))
+        configuration: Any = parse_json((folder / CONFIGURATION).read_bytes())
         state = load_file(folder / TENSORS)
     except (OSError, ValueError, SafetensorError) as error:
         raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None

@@ -23,12 +23,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from acwm_codecs.compact import PACKAGED_WEIGHTS, STRIDE, Compact
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
+from acwm_core.files import training_record, written_whole
 from acwm_core.model.shapes import check_finite
-from acwm_core.untrusted.weights import training_record
 
 CROP = 64
 LATENT_NOISE = 0.05

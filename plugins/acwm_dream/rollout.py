@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import UNREADABLE, from_npy
@@ -30,12 +29,12 @@ from acwm_core.errors import (
 )
 from acwm_core.evaluation import videos
 from acwm_core.evaluation.evaluate import check_actions, choose_device
+from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
 from acwm_core.model.world_model import Mode
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
-from acwm_core.untrusted import read_bytes
 
 SQUEEZED = 0.02
 """A picture whose sides have another ratio than the frames, by so much, is not used silently."""
@@ -217,7 +216,7 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
 def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
     """Read actions as `[N + 1, A]`; the last row is zero, and no frame follows it."""
     try:
-        rows = from_npy(read_bytes(path)).astype(np.float32)
+        rows = from_npy(path.read_bytes()).astype(np.float32)
     except (OSError, *UNREADABLE) as error:
         raise DataError(f"{path} cannot be read as a .npy array: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):

@@ -166,7 +166,7 @@ def main(
         "seed": seed,
     }
     if start:
-        from acwm_core.untrusted.weights import training_record
+        from acwm_core.files import training_record
         from acwm_estimators.weights import load
 
         load(network, start)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from acwm_core.cli.arguments import FOLDER, renamed_option, seed_numbers, split_options
-from acwm_core.data.atomic import writable
 from acwm_core.errors import RecipeError
+from acwm_core.files import writable
 
 if TYPE_CHECKING:
     from acwm_experiment.plan import ExperimentPlan

@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from acwm_core.data.atomic import held
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
 from acwm_core.executors import available_cores, create_executor
+from acwm_core.files import held
 from acwm_executors.batch import BatchExecutor, JobState
 from acwm_experiment.local import LocalRunner
 from acwm_experiment.plan import ExperimentPlan

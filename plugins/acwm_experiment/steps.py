@@ -12,10 +12,10 @@ from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, TrainingError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
+from acwm_core.files import parse_json
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
-from acwm_core.untrusted import parse_json, read_bytes
 from acwm_executors.batch import Job
 from acwm_experiment.files import slug
 from acwm_experiment.plan import ExperimentPlan
@@ -194,7 +194,7 @@ def is_evaluated(run: RunSpec) -> bool:
     """Whether the weights of a finished run were evaluated with its current recipe."""
     summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
     try:
-        found: Mapping[str, Any] = parse_json(read_bytes(summary))["provenance"]
+        found: Mapping[str, Any] = parse_json(summary.read_bytes())["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
         settings = {**EvaluationConfig().to_dict(), **found["evaluation"]}  # some may be new
         same = settings == EvaluationConfig(**run.recipe.evaluation).to_dict()

@@ -7,9 +7,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.errors import DataError
-from acwm_core.untrusted import parse_json, read_bytes, typed
+from acwm_core.files import parse_json, typed, written_whole
 from acwm_planning.jobs import PlanningJob
 
 FILE = "experiment.json"
@@ -87,7 +86,7 @@ class Experiment:
         """
         file = Path(folder) / FILE
         try:
-            values = parse_json(read_bytes(file))
+            values = parse_json(file.read_bytes())
             if values["format"] != FORMAT:
                 raise DataError(f"{file} was written by another version of acwm")
             for cell in values["cells"]:

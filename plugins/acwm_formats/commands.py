@@ -13,7 +13,6 @@ import click
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
 from acwm_core.errors import DataError, UnknownNameError
-from acwm_core.untrusted import printable
 
 if TYPE_CHECKING:
     from acwm_core.plugins import Registry
@@ -70,7 +69,7 @@ def check(path: Path, replays: int) -> int:
     failed = 0
     for finding in check_dataset(path, replays=replays):
         failed += finding.problem is not None
-        click.echo(printable(str(finding)))
+        click.echo(str(finding))
     if failed:
         click.echo(f"{failed} failed", err=True)
     return int(failed > 0)

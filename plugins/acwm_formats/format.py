@@ -18,13 +18,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from acwm_core.data.atomic import made_whole, writing
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError, MissingExtraError
 from acwm_core.executors import progress_bar
+from acwm_core.files import made_whole, writing
 from acwm_core.plugins import catalog
 from acwm_formats.recordings import RecordedDataset
 

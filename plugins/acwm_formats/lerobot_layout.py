@@ -13,13 +13,13 @@ import contextlib
 import importlib
 import re
 from collections.abc import Generator, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from acwm_core.data.shards import UNREADABLE
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import AcwmError, DataError
-from acwm_core.untrusted import most_values, parse_json, printable, read_bytes
+from acwm_core.files import inside, parse_json
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -122,7 +122,6 @@ def read_columns(path: Path, names: list[str], episode: int | None = None) -> An
     order = ["episode_index", "frame_index"]
     filters = None if episode is None else [("episode_index", "==", episode)]
     try:
-        most_values(path)
         table = parquet.read_table(path, columns=[*order, *names], filters=filters)
         return table.sort_by([(name, "ascending") for name in order]).select(names)
     except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
@@ -130,7 +129,7 @@ def read_columns(path: Path, names: list[str], episode: int | None = None) -> An
 
 
 def _unreadable(path: Path, error: Exception) -> DataError:
-    reason = " ".join(printable(str(error)).split())[:200] or type(error).__name__
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
     return DataError(f"{path} cannot be read ({reason})")
 
 
@@ -153,7 +152,6 @@ def _rows(root: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for path in paths:
         try:
-            most_values(path)
             file = parquet.ParquetFile(path)
             plain = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             rows += file.read(columns=plain).to_pylist()
@@ -166,7 +164,7 @@ def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The episodes in the index of version 2, where each episode has its own files."""
     path = root / "meta" / "episodes.jsonl"
     try:
-        rows = [parse_json(line) for line in read_bytes(path, MAX_BYTES).splitlines()]
+        rows = [parse_json(line) for line in path.read_bytes().splitlines()]
         return [{**row, "chunk": row["episode_index"] // info["chunks_size"]} for row in rows]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
@@ -204,15 +202,12 @@ def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
         given = names[found[1]]
         return f"{given:0{found[2]}d}" if found[2] else str(given)
 
-    name = PurePosixPath(re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
-    if name.is_absolute() or ".." in name.parts:
-        raise DataError(f"{root / INFO} leads out of the dataset: {name}")
-    return root / name
+    return inside(root, re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        content = parse_json(read_bytes(path, MAX_BYTES))
+        content = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {path.parents[1]} is not a LeRobot dataset") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from acwm_core.data.atomic import writable, written_whole
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.video import write_mp4
 from acwm_core.env.episode import Split
+from acwm_core.files import writable, written_whole
 
 Picture = NDArray[np.uint8]
 """``[H, W, 3]`` uint8; a video has a leading axis T."""

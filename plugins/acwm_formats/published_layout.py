@@ -9,7 +9,6 @@ ROOT/CATEGORY/ENVIRONMENT/{ind_train,ind_test,ood_test}/episode_{i}.mp4
 from __future__ import annotations
 
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError
-from acwm_core.training.plain_tensors import load_plain
+from acwm_core.files import load_plain
 
 CITATION = "ACWM-Phys, arXiv:2605.08567"
 METADATA = "metadata.pt"
@@ -73,28 +72,11 @@ def read_entries(path: Path) -> list[Entry]:
     Raises:
         DataError: it is missing or damaged, holds code, or has unexpected content.
     """
-    content = _load(path)
+    content = load_plain(path)
     if not isinstance(content, list) or not content:
         raise DataError(f"{path} holds no list of episodes")
     values = cast(list[Any], content)
     return [_entry(f"episode {i} of {path}", value, i) for i, value in enumerate(values)]
-
-
-def _load(path: Path) -> object:
-    if path.is_file() and _size(path) > MAX_BYTES:
-        raise DataError(f"{path} would need more than {MAX_BYTES >> 20} MB: it is not metadata")
-    return load_plain(path)
-
-
-def _size(path: Path) -> int:
-    """The size of a file in bytes, uncompressed if it is an archive."""
-    if not zipfile.is_zipfile(path):
-        return path.stat().st_size
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return sum(member.file_size for member in archive.infolist())
-    except Exception:  # a forged archive may raise anything; loading it then reports it as damaged
-        return path.stat().st_size
 
 
 def _entry(what: str, value: object, index: int) -> Entry:

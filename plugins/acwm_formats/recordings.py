@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import writing
 from acwm_core.data.card import DatasetCard, package_versions
 from acwm_core.data.dataset import Manifest
 from acwm_core.data.generate import fill
@@ -21,6 +20,7 @@ from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
 from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, Split
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.executors import LocalExecutor
+from acwm_core.files import writing
 
 UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
 

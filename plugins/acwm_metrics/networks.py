@@ -11,8 +11,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
+from acwm_core.files import load_plain
 from acwm_core.model.shapes import check_finite
-from acwm_core.training.plain_tensors import load_plain
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
-from acwm_core.untrusted import parse_json, read_bytes
+from acwm_core.files import parse_json
 
 PLANS = "planning"
 """Folder within a run folder, or an experiment's, with a folder of results for each task."""
@@ -49,7 +49,7 @@ class PlanningJob:
         as a scripted solution, are not missing.
         """
         try:
-            made: Mapping[str, Any] = parse_json(read_bytes(self.folder / SUMMARY))
+            made: Mapping[str, Any] = parse_json((self.folder / SUMMARY).read_bytes())
             asked = {"environment": self.environment, "task": self.task, **self.settings}
             if any(made.get(name) != value for name, value in asked.items()):
                 return 0.0

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from jinja2 import Environment, select_autoescape
 
-from acwm_core.data.atomic import writing, written_whole
+from acwm_core.files import writing, written_whole
 from acwm_core.recipe.types import show
 from acwm_planning.settings import ROWS
 from acwm_planning.table import VIDEOS, RowSummary

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.atomic import held, writing, written_whole
 from acwm_core.errors import DataError
-from acwm_core.untrusted import parse_json
+from acwm_core.files import held, parse_json, writing, written_whole
 
 EPISODES, SETTINGS = "episodes.jsonl", "settings.json"
 """Files in the folder."""

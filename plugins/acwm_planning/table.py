@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from acwm_core.data.atomic import writing, written_whole
 from acwm_core.evaluation.statistics import CONFIDENCE, Estimate, with_interval
+from acwm_core.files import writing, written_whole
 from acwm_planning.resumable import Line
 from acwm_planning.settings import ROWS
 

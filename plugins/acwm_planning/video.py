@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import writing, written_whole
 from acwm_core.data.video import write_mp4
 from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, judged
 from acwm_core.evaluation import videos
+from acwm_core.files import writing, written_whole
 from acwm_core.model.shapes import Clip
 from acwm_planning.episode import EpisodeResult
 from acwm_planning.futures import History, ModelRollouts

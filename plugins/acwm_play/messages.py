@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.episode import FactorValue
 from acwm_core.errors import DataError
-from acwm_core.untrusted import parse_json, typed
+from acwm_core.files import parse_json, typed
 
 MAX_MESSAGE = 2**14
 """Largest size of a message from the page, in bytes."""

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.data.atomic import held, writing
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
@@ -22,6 +21,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import OtherDatasetError
 from acwm_core.evaluation.videos import join, magnification, panels
+from acwm_core.files import held, writing
 from acwm_core.plugins import catalog
 from acwm_play.simulator import TimeStep
 

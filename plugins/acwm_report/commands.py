@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.arguments import FOLDER, OUT_FILE, OUT_FOLDER, RUN
-from acwm_core.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -101,7 +100,7 @@ def leaderboard(folder: Path, out: Path | None) -> None:
 
     page, found = write_leaderboard(folder, out)
     for name, why in found.broken.items():
-        click.echo(printable(f"left out {name}: {why}"), err=True)
+        click.echo(f"left out {name}: {why}", err=True)
     click.echo(page)
 
 

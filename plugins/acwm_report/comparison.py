@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError, suggest
 from acwm_core.evaluation.results import Score, Summary
 from acwm_core.evaluation.statistics import holm, paired_bootstrap
 from acwm_core.evaluation.storage import read_scores
+from acwm_core.files import writable, written_whole
 from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], Score]

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from acwm_core.data.atomic import written_whole
+from acwm_core.files import written_whole
 
 SIZE = (5.2, 3.1)
 """Width and height in inches; the page scales the drawing."""

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.untrusted import read_bytes
 from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
@@ -94,7 +93,7 @@ def collect(folder: Path) -> Collection:
         try:
             if not path.resolve().is_relative_to(folder.resolve()):
                 raise DataError(f"{path} is a link that leads out of {folder}")
-            digest = hashlib.sha256(read_bytes(path)).hexdigest()
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
             if digest in seen:
                 found.copies += 1
                 continue

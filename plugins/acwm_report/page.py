@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import acwm_core
-from acwm_core.data.atomic import writable, written_whole
 from acwm_core.errors import DataError
+from acwm_core.files import writable, written_whole
 from acwm_experiment.table import Experiment
 from acwm_report import charts, plans, rankings, run, tables
 from acwm_report.comparison import run_labels

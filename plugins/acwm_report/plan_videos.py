@@ -10,7 +10,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from acwm_core.untrusted import read_bytes, read_json
+from acwm_core.files import read_json
 from acwm_report.plans import distance_scale, plan_results
 from acwm_report.run import EvaluatedRun, result_files
 
@@ -185,4 +185,4 @@ def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[Plan
 def _video(path: Path) -> bytes:
     """The bytes of the video beside its curves; empty if the file is missing or empty."""
     video = path.with_suffix(".mp4")
-    return read_bytes(video, MOST_BYTES) if video.is_file() else b""
+    return video.read_bytes() if video.is_file() else b""

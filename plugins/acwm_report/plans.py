@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from acwm_core.evaluation.results import Estimate
-from acwm_core.untrusted import read_json
+from acwm_core.files import read_json
 from acwm_planning.jobs import PLANS, SUMMARY
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.score_grid import MISSING, Cell, Column, Scale

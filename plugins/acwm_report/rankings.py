@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from acwm_core.untrusted import read_json
+from acwm_core.files import read_json
 from acwm_planning.policies.ranking import FILE, FOLDER, Ranking
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun, result_files

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from acwm_core.untrusted import read_json
+from acwm_core.files import read_json
 from acwm_experiment.table import Experiment
 from acwm_planning.jobs import SUMMARY, PlanningJob
 from acwm_report.plan_videos import PlanVideo, VideoRoom

@@ -14,8 +14,8 @@ from pydantic import Field
 from acwm_core.env.episode import REGIONS, Factor, FactorValue
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.results import FOLDER, MetricInfo, SetSummary
+from acwm_core.files import read_json
 from acwm_core.recipe.text import parse
-from acwm_core.untrusted import read_json
 
 SEVERITY = "severity"
 """Folder below ``RUN/evaluation`` for curves and the data they are computed from."""

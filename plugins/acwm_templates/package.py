@@ -10,8 +10,8 @@ from typing import Any
 
 import jinja2
 
-from acwm_core.data.atomic import made_whole
 from acwm_core.errors import RecipeError
+from acwm_core.files import made_whole
 from acwm_core.plugins import catalog
 from acwm_templates.kinds import KINDS
 

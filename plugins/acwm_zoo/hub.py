@@ -9,8 +9,8 @@ from pathlib import Path
 
 from huggingface_hub import HfApi
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.files import written_whole
 from acwm_zoo.packing import FILES
 
 SCHEME = "hf://"

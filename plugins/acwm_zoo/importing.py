@@ -13,15 +13,14 @@ from typing import Any, NamedTuple, cast
 import safetensors
 import safetensors.torch
 
-from acwm_core.data.atomic import written_whole
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
 from acwm_core.env.environment import EnvironmentCard, resolve_size
 from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
+from acwm_core.files import load_plain, written_whole
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import with_overrides
-from acwm_core.training.plain_tensors import load_plain
 from acwm_core.training.run import RunFolder, save_weights
 from acwm_zoo.importer import CheckpointImporter, ForeignModel, convert, recipe_of
 

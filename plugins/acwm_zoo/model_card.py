@@ -14,7 +14,6 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.results import Estimate, Summary
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, read_metadata
-from acwm_core.untrusted import read_bytes
 
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
 
@@ -89,7 +88,7 @@ def _curve(metrics: Path) -> str:
     """
     rows: dict[int, dict[str, str]] = {}
     try:
-        text = read_bytes(metrics, MAX_BYTES).decode() if metrics.is_file() else ""
+        text = metrics.read_bytes().decode() if metrics.is_file() else ""
         for row in csv.DictReader(io.StringIO(text, newline="")):
             kept = {name: row[name] for name in SHOWN if row.get(name)}
             rows.setdefault(int(row["step"]) + 1, {}).update(kept)

@@ -12,11 +12,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 
-from acwm_core.data.atomic import made_whole, writing
 from acwm_core.errors import TrainingError
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import EPISODES
+from acwm_core.files import made_whole, writing
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights, training_of
 from acwm_zoo.model_card import model_card

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from acwm_core.untrusted import printable
-
 MODELS, CARD = Path(__file__).with_name("models"), "README.md"
 
 
@@ -25,4 +23,4 @@ def about(model: str) -> str:
     """The title of a model's card."""
     card = (MODELS / model / CARD).read_text(encoding="utf-8", errors="replace")
     title = re.search(r"^# (.+)$", card, re.MULTILINE)
-    return printable(title[1]) if title else ""
+    return title[1] if title else ""

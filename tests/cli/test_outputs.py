@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from acwm_core.cli import main
-from acwm_core.data.atomic import writable
 from acwm_core.errors import DataError
+from acwm_core.files import writable
 from acwm_core.plugins import catalog
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
@@ -105,7 +105,7 @@ def test_what_others_forbid_is_said(tmp_path, monkeypatch):
     def full(**_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("acwm_core.data.atomic.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("acwm_core.files.tempfile.TemporaryFile", full)
     with pytest.raises(DataError, match=r"cannot be written .No space left on device.: choose"):
         writable(locked / "out")
 
@@ -170,7 +170,7 @@ def test_a_folder_that_a_command_makes_whole_is_asked_for_first(tmp_path, monkey
     said = said_by(["new", "metric", "neat", "--out", "file/neat"], capsys)
     assert said == "acwm: cannot write file/neat: file is not a folder; choose another place"
     monkeypatch.setattr(
-        "acwm_core.data.atomic.tempfile.TemporaryFile", lambda dir: refused.callback(errno.EROFS)
+        "acwm_core.files.tempfile.TemporaryFile", lambda dir: refused.callback(errno.EROFS)
     )
     said = said_by(["new", "metric", "neat"], capsys)
     assert said.startswith("acwm: acwm_neat cannot be written (Read-only file system): choose")

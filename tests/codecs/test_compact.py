@@ -10,8 +10,8 @@ from acwm_codecs.compact import PACKAGED_WEIGHTS, Compact, fold, unfold
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
+from acwm_core.files import training_record
 from acwm_core.plugins import catalog
-from acwm_core.untrusted.weights import training_record
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError
-from acwm_core.untrusted.weights import training_record
+from acwm_core.files import training_record
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.atomic import writing, written_whole
 from acwm_core.errors import DataError
+from acwm_core.files import writing, written_whole
 from acwm_core.training.run import save_weights
 
 
@@ -40,7 +40,7 @@ def test_whatever_a_library_leaves_does_too(mode, tmp_path):
 DIE = """
 import os, sys
 from pathlib import Path
-from acwm_core.data.atomic import written_whole
+from acwm_core.files import written_whole
 with written_whole(Path(sys.argv[1])) as partial:
     partial.write_text("half")
     os._exit(1)

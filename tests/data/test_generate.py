@@ -15,7 +15,6 @@ from conftest import EPISODES, checksums
 from square_world import Square
 
 from acwm_core.cli.main import main
-from acwm_core.data.atomic import alone, held
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.generate import generate, parse_episodes
@@ -23,6 +22,7 @@ from acwm_core.data.shards import open_shard
 from acwm_core.data.simulate import ShardTask, make_shard, simulated
 from acwm_core.errors import DataError, RecipeError, UnknownNameError
 from acwm_core.executors import LocalExecutor, progress_bar
+from acwm_core.files import alone, held
 from acwm_core.plugins import catalog
 
 
@@ -163,7 +163,7 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, square_data):
 
 def test_the_loser_of_two_commands_is_told_so_before_there_is_a_card(tmp_path, monkeypatch):
     """The winner has made its folders and is about to write the card."""
-    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    monkeypatch.setattr("acwm_core.files.ENDING_SECONDS", 0.0)
     (tmp_path / "train").mkdir()
     with held(tmp_path), pytest.raises(DataError, match="another command is writing"):
         generate("square", tmp_path, episodes={"train": 2}, workers=0, progress=False)

@@ -14,8 +14,8 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError, ShapeError, UnknownNameError
 from acwm_core.evaluation.score import estimator_for
+from acwm_core.files import training_record
 from acwm_core.plugins import catalog
-from acwm_core.untrusted.weights import training_record
 from acwm_estimators import limits
 from acwm_estimators.estimator import Estimator
 from acwm_estimators.plugin import WEIGHTS

@@ -7,12 +7,12 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli.main import main
-from acwm_core.data.atomic import held
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
 from acwm_core.evaluation.storage import EPISODES, read_scores, replacing_result, result_file
+from acwm_core.files import held
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
 from acwm_severity.sweep import sweep_severity
@@ -107,7 +107,7 @@ def test_a_result_that_cannot_be_read_is_worth_nothing(run, text):
 
 
 def test_two_evaluations_at_once_are_refused(run, monkeypatch):
-    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    monkeypatch.setattr("acwm_core.files.ENDING_SECONDS", 0.0)
     with held(run / FOLDER), pytest.raises(DataError, match="another command is writing to"):
         evaluate_run(run, progress=False)
 

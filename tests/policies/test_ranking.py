@@ -5,8 +5,8 @@ import pytest
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.files import read_json
 from acwm_core.training.run import load_run
-from acwm_core.untrusted import read_json
 from acwm_planning.policies.commands import print_ranking
 from acwm_planning.policies.ranking import FILE, Ranking
 from acwm_planning.policies.run import Ranker, rank_policies

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file, save_file
 
-from acwm_core.data.atomic import held
 from acwm_core.data.clips import ClipDataset
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.loader import ClipLoader, ClipSampler
 from acwm_core.errors import AcwmError, DataError, TrainingError
+from acwm_core.files import held
 from acwm_core.plugins import catalog
 from acwm_core.training.checkpoints import read_details
 from acwm_core.training.fit import fit
@@ -58,7 +58,7 @@ def test_a_validation_that_is_not_finite_stops_the_run(data, tmp_path):
 def test_a_run_that_another_command_trains_is_not_judged_by_its_files(data, tmp_path, monkeypatch):
     monkeypatch.setattr(Kill, "batch", 1)
     run = killed_run(data, tmp_path / "run", monkeypatch)  # no checkpoint yet
-    monkeypatch.setattr("acwm_core.data.atomic.ENDING_SECONDS", 0.0)
+    monkeypatch.setattr("acwm_core.files.ENDING_SECONDS", 0.0)
     for resume in (None, "auto"):
         with held(run.path), pytest.raises(DataError, match="another command is writing to"):
             fit(killable(data), run.path, resume=resume)

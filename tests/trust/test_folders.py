@@ -7,9 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data.atomic import alone, held, written_whole
 from acwm_core.errors import DataError
-from acwm_core.untrusted import check_folder, read_bytes
+from acwm_core.files import alone, held, written_whole
 from tests.report.synthetic import clips, run
 
 MINE = "what the user wrote\n"

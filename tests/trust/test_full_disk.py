@@ -13,8 +13,8 @@ import torch
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data.atomic import disk_error, made_whole, written_whole
 from acwm_core.data.generate import generate
+from acwm_core.files import disk_error, made_whole, written_whole
 from acwm_core.plugins import catalog
 from tests.planning import tiny as planning
 from tests.report.synthetic import clips, run

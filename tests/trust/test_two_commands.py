@@ -9,9 +9,8 @@ import torch
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.data import atomic
-from acwm_core.data.atomic import alone, held, made_whole
 from acwm_core.errors import DataError, TrainingError
+from acwm_core.files import alone, held, made_whole
 from acwm_core.plugins import catalog
 from acwm_core.training import fit as fitting
 from acwm_core.training import trained

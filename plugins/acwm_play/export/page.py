@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from acwm_core.data.atomic import made_whole, writing
 from acwm_core.errors import RecipeError
+from acwm_core.files import made_whole, writing
 from acwm_play.about import about_world, places
 from acwm_play.dream import Dream
 from acwm_play.export.episodes import EPISODES, Recorded, maps, record

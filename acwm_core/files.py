@@ -1,23 +1,25 @@
-"""Atomic file writes, and locks that allow one writer per folder or file."""
+"""Files and folders: written whole, by one command at a time, and read without running anything."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
+import functools
 import glob
+import json
 import os
-import re
 import shutil
 import socket
-import stat
 import tempfile
-import time
+import warnings
+import zipfile
 from collections.abc import Generator
 from pathlib import Path
-from typing import IO
+from typing import Any, TypeVar, cast
 
 from acwm_core.errors import AcwmError, DataError
+
+T = TypeVar("T")
 
 PARTIAL, LOCK = ".partial", ".lock"
 
@@ -30,10 +32,10 @@ OF_THE_DISK = (
 )
 """Errors that mean the file cannot be written, whatever its content."""
 
-FULL = re.compile(r"PytorchStreamWriter|inline_container|iostream|\d requested and \d+ written")
-"""How PyTorch and NumPy report a full disk, without an error number."""
+FULL = 2**20
+"""Free bytes below which a disk is full, where a library fails to write without an error number."""
 
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
 """Errors of a file system without locks, as on some clusters."""
 
 
@@ -50,12 +52,11 @@ def written_whole(path: Path) -> Generator[Path]:
     """
     begin = f".{path.name}.{socket.gethostname()}-"  # other nodes may share the folder
     partial = path.with_name(f"{begin}{os.getpid()}{PARTIAL}")
-    folder = os.open(path.parent, os.O_RDONLY)
+    for left in path.parent.glob(f"{glob.escape(begin)}*{PARTIAL}"):
+        if not _runs(left.name[len(begin) : -len(PARTIAL)]):
+            left.unlink(missing_ok=True)
     try:
-        for left in path.parent.glob(f"{glob.escape(begin)}*{PARTIAL}"):
-            if not _runs(left.name[len(begin) : -len(PARTIAL)]):
-                left.unlink(missing_ok=True)
-        partial.unlink(missing_ok=True)  # it may be a symlink to another place
+        partial.unlink(missing_ok=True)  # it may be a link to another place
         partial.touch()
         mode = partial.stat().st_mode  # follows the umask, which some libraries ignore
         yield partial
@@ -63,15 +64,15 @@ def written_whole(path: Path) -> Generator[Path]:
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
-        os.fsync(folder)  # so that the rename survives a power cut
     except BaseException as error:
+        is_full = shutil.disk_usage(path.parent).free < FULL
         partial.unlink(missing_ok=True)
         found = disk_error(error)
+        if found is None and is_full and isinstance(error, Exception):
+            found = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if found is not None and found.filename in (None, str(partial)):
             raise OSError(found.errno, found.strerror, str(path)) from error
         raise
-    finally:
-        os.close(folder)
 
 
 def _runs(pid: str) -> bool:
@@ -90,12 +91,6 @@ def disk_error(error: BaseException | None) -> OSError | None:
     while error is not None:
         if isinstance(error, OSError) and error.errno in OF_THE_DISK:
             return error
-        said = str(error)
-        for code in OF_THE_DISK:
-            if f"os error {code})" in said or os.strerror(code) in said:
-                return OSError(code, os.strerror(code))
-        if FULL.search(said):
-            return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         error = error.__cause__ or error.__context__
     return None
 
@@ -175,9 +170,8 @@ def remove_partial(folder: Path, of: str = "") -> None:
 def held(folder: Path, told: Path | None = None) -> Generator[None]:
     """Lock `folder` against other writers; the lock ends with the process, however it ends.
 
-    On Linux the lock also works across nodes if the file system passes locks on, as NFS does. On a
-    file system without locks a second writer is not refused and may make the first one fail, but
-    files under their final names are complete even then.
+    On a file system without locks a second writer is not refused and may make the first one fail,
+    but files under their final names are complete even then.
 
     Args:
         told: the folder to name in the message, if it is another one.
@@ -185,10 +179,7 @@ def held(folder: Path, told: Path | None = None) -> Generator[None]:
     Raises:
         DataError: another process holds the lock.
     """
-    with _lock_file(folder / LOCK) as lock:
-        patience = time.monotonic() + ENDING_SECONDS
-        while not (is_held := _locked(lock, wait=False)) and time.monotonic() < patience:
-            time.sleep(0.05)
+    with _locked(folder / LOCK, ENDING_SECONDS) as is_held:
         if not is_held:
             raise DataError(
                 f"another command is writing to {told or folder}; wait for it or choose another "
@@ -210,36 +201,152 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
     Yields:
         Whether this process holds the lock. A previous holder may have made the file already.
     """
-    with _lock_file(path.with_name(f".{path.name}.lock")) as lock:
-        if not _locked(lock, wait):
-            yield False
-            return
-        remove_partial(path.parent, f"{path.name}.")
-        yield True
+    with _locked(path.with_name(f".{path.name}{LOCK}"), -1 if wait else 0) as is_held:
+        if is_held:
+            remove_partial(path.parent, f"{path.name}.")
+        yield is_held
 
 
-def _lock_file(path: Path) -> IO[bytes]:
-    """Open a lock file. It is not changed, and a symlink is refused."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+@contextlib.contextmanager
+def _locked(path: Path, seconds: float) -> Generator[bool]:
+    """Lock a file, waiting for so many seconds (-1: for ever); yields whether it is locked."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path, timeout=seconds)
     try:
-        file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
-    except OSError as error:
-        if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
-            raise
-    else:
-        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            return file
-        file.close()
-    raise DataError(f"{path} is not a regular file: remove it")
-
-
-def _locked(file: IO[bytes], wait: bool) -> bool:
-    """Lock an open file, or return False if another process holds the lock."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        return False
+        lock.acquire()
+    except Timeout:
+        yield False
+        return
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
-    return True
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The file `name` of `folder`, for names that come from a file.
+
+    Raises:
+        DataError: the name, or a link on its way, leads out of the folder.
+    """
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DataError(f"{path} leads out of {folder}, which is not allowed: put the file there")
+    return path
+
+
+def check_inside(folder: Path, *own: str) -> None:
+    """Refuse links that lead out of `folder` among the files that acwm reads or writes there.
+
+    Args:
+        folder: a dataset or a run.
+        *own: patterns of the files, e.g. ``"*/*.tar"``. Other files are none of acwm's business.
+
+    Raises:
+        DataError: there is such a link; names it.
+    """
+    for pattern in own:
+        for path in folder.glob(pattern):
+            inside(folder, str(path.relative_to(folder)))
+
+
+def parse_json(data: bytes | str) -> Any:
+    """Parse JSON whose numbers are finite.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    found = json.loads(data)
+    json.dumps(found, allow_nan=False)
+    return found
+
+
+def read_json(path: Path, kind: type[T], what: str) -> T:
+    """Read a JSON file as a dataclass; entries that the dataclass does not have are left out.
+
+    Args:
+        path: the file.
+        kind: a dataclass.
+        what: what the file should be, for the message, e.g. ``"a summary"``.
+
+    Raises:
+        DataError: it is damaged, or of another version of acwm.
+        OSError: it does not exist or cannot be read.
+    """
+    try:
+        return typed(parse_json(path.read_bytes()), kind)
+    except ValueError as error:
+        why = f"{path} is not {what} of this version of acwm ({error})"
+        raise DataError(why) from None
+
+
+def typed(values: Any, kind: type[T]) -> T:
+    """Convert values of JSON types to `kind`, checked strictly: a string never becomes a number.
+
+    Raises:
+        ValueError: a value has the wrong type or is not finite; the one-line message says which.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(kind).validate_json(json.dumps(values, allow_nan=False), strict=True)
+    except ValidationError as error:
+        reason = error.errors()[0]
+        where = ".".join(map(str, reason["loc"]))[:200]
+        said = reason["msg"].splitlines()[0].removeprefix("Value error, ")[:200]
+        raise ValueError(f"{where}: {said}" if where else said) from None
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter[Any](kind)
+
+
+def training_record(path: Path) -> dict[str, Any]:
+    """How the weights in a safetensors file were made (data, seed, steps), as the file says.
+
+    Raises:
+        DataError: the file is damaged, or does not say it.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with cast(Any, safe_open)(path, framework="numpy") as file:
+            return dict(parse_json((file.metadata() or {}).get("training", "{}")))
+    except (OSError, SafetensorError, ValueError, TypeError) as error:
+        raise DataError(f"{path} does not say how its weights were made ({error})") from error
+
+
+def load_plain(path: Path, *, on_disk: bool = False) -> object:
+    """The numbers, text, tensors, arrays, lists and dicts in a file of `torch.save`.
+
+    Args:
+        on_disk: leave the tensors in the file until they are used, if its format allows this.
+
+    Raises:
+        DataError: it is missing, damaged, or holds anything else; nothing in it was run.
+    """
+    import numpy as np
+    import torch
+
+    scalar, array = np.float64(0).__reduce__()[0], np.zeros(0).__reduce__()[0]
+    dtypes = {type(np.dtype(code)) for code in "?bhilqBHILQefdSU"}
+    old = (scalar, "numpy.core.multiarray.scalar"), (array, "numpy.core.multiarray._reconstruct")
+    plain: list[Any] = [np.ndarray, np.dtype, *dtypes, scalar, array, *old]
+    if not path.is_file():
+        raise DataError(f"{path} is missing")
+    mapped = on_disk and zipfile.is_zipfile(path)  # before PyTorch 1.6 it was no zip
+    try:
+        with torch.serialization.safe_globals(plain), warnings.catch_warnings(action="ignore"):
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+    except Exception as error:  # a damaged file can make the parsers raise anything
+        raise DataError(
+            f"{path} is damaged, or holds more than numbers and text, and nothing in it was run "
+            f"({type(error).__name__})"
+        ) from error
