@@ -318,7 +318,8 @@ def training_record(path: Path) -> dict[str, Any]:
 
     try:
         with cast(Any, safe_open)(path, framework="numpy") as file:
-            return dict(parse_json((file.metadata() or {}).get("training", "{}")))
+            metadata: dict[str, str] = file.metadata() or {}
+        return dict(parse_json(metadata.get("training", "{}")))
     except (OSError, SafetensorError, ValueError, TypeError) as error:
         raise DataError(f"{path} does not say how its weights were made ({error})") from error
 

@@ -9,7 +9,6 @@ import zipfile
 import zlib
 from dataclasses import asdict
 
-import av
 import numpy as np
 import yaml
 
@@ -32,14 +31,6 @@ def npy(array):
     return buffer.getvalue()
 
 
-def claims(shape, dtype="<f4", data=b""):
-    """A ``.npy`` file that claims a shape and holds something else."""
-    buffer = io.BytesIO()
-    header = {"descr": dtype, "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(buffer, header)
-    return buffer.getvalue() + data
-
-
 def zipped(contents, method=zipfile.ZIP_STORED):
     """A zip archive."""
     buffer = io.BytesIO()
@@ -47,34 +38,6 @@ def zipped(contents, method=zipfile.ZIP_STORED):
         for name, content in contents.items():
             archive.writestr(name, content)
     return buffer.getvalue()
-
-
-def film(height, width, frames=2):
-    """A black video, which takes few bytes whatever its size."""
-    buffer = io.BytesIO()
-    with av.open(buffer, "w", format="matroska") as output:
-        stream = output.add_stream("libx264rgb", rate=10)
-        stream.height, stream.width, stream.pix_fmt = height, width, "rgb24"
-        stream.options = {"qp": "0", "preset": "ultrafast"}
-        for _ in range(frames):
-            frame = av.VideoFrame(width, height, "rgb24")
-            frame.planes[0].update(bytes(frame.planes[0].buffer_size))
-            output.mux(stream.encode(frame))
-        output.mux(stream.encode(None))
-    return buffer.getvalue()
-
-
-def append(folder, name, **header):
-    """Add a tar header with these fields to the first training shard, behind all members."""
-    path = folder / "train/shard-00000.tar"
-    with tarfile.open(path) as tar:
-        last = tar.getmembers()[-1]
-    info = tarfile.TarInfo(name)
-    for field, value in header.items():
-        setattr(info, field, value)
-    whole = path.read_bytes()[: last.offset_data + -(-last.size // 512) * 512]
-    path.write_bytes(whole + info.tobuf(tarfile.GNU_FORMAT) + bytes(1024))
-    sign(folder)
 
 
 def replaced(name, data):

@@ -22,7 +22,7 @@ def latest(tmp_path):
 def test_pickled_code_is_not_run(zipped, latest, tmp_path):
     mark = tmp_path / "mark"
     path = latest({**content(), "config": Attack(mark)}, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(CheckpointError, match=r"system\).*nothing in it was run"):
+    with pytest.raises(CheckpointError, match="nothing in it was run"):
         import_checkpoint(path, tmp_path / "run", WORDS)
     assert not mark.exists()
     assert not (tmp_path / "run").exists()

@@ -1,17 +1,12 @@
 """The published layout, damaged or made to do harm: each gets a sentence and nothing is run."""
 
-import io
 import pickle
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
-from acwm_formats import video
 from acwm_formats.published import Published
 from tests.formats import release
 from tests.formats.conftest import load_published as load
@@ -30,7 +25,7 @@ def test_pickled_code_is_not_run(folder, tmp_path, zipped):
     path, mark = folder / "ind_train" / "metadata.pt", tmp_path / "mark"
     entries = spoilt(torch.load(path, weights_only=False), mark)
     torch.save(entries, path, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(DataError, match=r"system\), or is damaged: it was not loaded"):
+    with pytest.raises(DataError, match="nothing in it was run"):
         load(folder, tmp_path / "data")
     assert not mark.exists()
     assert not (tmp_path / "data").exists()
@@ -46,25 +41,15 @@ def test_pickled_code_is_not_run(folder, tmp_path, zipped):
 def test_what_is_no_metadata_is_refused(folder, content):
     (folder / "ind_train" / "metadata.pt").write_bytes(content)
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        Published().read(folder)
+        Published(folder).read()
 
 
-def test_cut_and_swollen_metadata_are_refused(folder):
+def test_cut_metadata_is_refused(folder):
     path = folder / "ind_train" / "metadata.pt"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        Published().read(folder)
-    swollen = io.BytesIO()
-    with (
-        zipfile.ZipFile(swollen, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("metadata/data.pkl", "w", force_zip64=True) as member,
-    ):
-        for _ in range(1100):
-            member.write(bytes(2**20))
-    path.write_bytes(swollen.getvalue())  # a megabyte
-    with pytest.raises(DataError, match="would need more than 1024 MB"):
-        Published().read(folder)
+        Published(folder).read()
 
 
 @pytest.mark.parametrize(
@@ -85,7 +70,7 @@ def test_cut_and_swollen_metadata_are_refused(folder):
 def test_entries_that_cannot_be_are_refused(folder, change, problem):
     release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
     with pytest.raises(DataError, match=problem):
-        Published().read(folder)
+        Published(folder).read()
 
 
 def test_videos_that_cannot_be_are_refused(folder, tmp_path):
@@ -107,18 +92,3 @@ def test_an_episode_of_one_frame_is_named(folder, tmp_path):
     release.rewrite(folder / "ind_train", lambda entries: entries[2].update(length=1))
     with pytest.raises(DataError, match="episode 2 of train: it has 1 usable frames"):
         load(folder, tmp_path / "data")
-
-
-def test_absurd_videos_cost_little(folder, tmp_path, monkeypatch):
-    large = tmp_path / "large.mp4"
-    release.video(large, np.zeros((1, 6144, 6144, 3), np.uint8), preset="ultrafast")
-    path = folder / "ind_train" / "episode_3.mp4"
-    path.write_bytes(large.read_bytes())
-    with pytest.raises(DataError, match="claims frames of 6144×6144"):
-        load(folder, tmp_path / "data")
-    release.video(path, np.zeros((3000, 64, 64, 3), np.uint8))
-    load(folder, tmp_path / "data")
-    assert EpisodeDataset(tmp_path / "data", "train").lengths[3] == 12
-    monkeypatch.setattr(video, "MAX_BYTES", 10 * 64 * 64 * 3)
-    with pytest.raises(DataError, match="more than 10 frames of 64×64"):
-        load(folder, tmp_path / "other")

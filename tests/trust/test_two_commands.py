@@ -39,7 +39,7 @@ def parts():
 
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch):
-    monkeypatch.setattr(atomic, "ENDING_SECONDS", 0.0)
+    monkeypatch.setattr("acwm_core.files.ENDING_SECONDS", 0.0)
 
 
 @pytest.fixture(scope="module")
