@@ -23,6 +23,9 @@ from acwm_core.recipe.recipe import flat_items
 CARD, MANIFEST = "card.yaml", "manifest.jsonl"
 """The files of a data folder, and of each split in it."""
 
+OWN = (CARD, "README.md", f"*/{MANIFEST}", "*/*.tar", "latents", "latents/**/*")
+"""Patterns of acwm's own files in a data folder."""
+
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
 """Exceptions that reading a card raises if the file is not a card."""
 
