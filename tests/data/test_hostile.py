@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
-from acwm_core.data.card import MANIFEST
 from conftest import checksums
 from forging import forge, npy, problems, replaced, sign, zipped
 
+from acwm_core.data.card import MANIFEST
 from tests.plugins import Attack
 
 SHARD = "train/shard-00000.tar"
