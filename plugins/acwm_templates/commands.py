@@ -29,6 +29,7 @@ def new(kind: str, name: str, out: Path | None, environment: str) -> None:
       codec         video to latents and back
       model         predicts latents
       conditioner   brings actions into a model
+      objective     how a model learns, and how it predicts
       metric        scores predicted video
       task          a goal in an environment, with a distance and success
       planner       chooses actions

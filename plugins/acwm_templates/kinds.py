@@ -38,6 +38,11 @@ KINDS = {
         "a linear layer of the actions of each latent frame",
         "acwm fit push_cube_small conditioner=NAME",
     ),
+    "objective": Kind(
+        "objective",
+        "diffusion forcing whose past is never noisier than its future",
+        "acwm fit push_cube_small objective=NAME",
+    ),
     "metric": Kind(
         "metric",
         "mean absolute error of pixels",

@@ -89,7 +89,7 @@ def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _imported(text: str) -> set[str]:
     """The names that a module imports from acwm itself."""
-    lines = re.findall(r"^from acwm_(?:core|sim)\S* import (.*)$", text, re.M)
+    lines = re.findall(r"^from acwm_(?:core|planning|sim)\S* import (.*)$", text, re.M)
     return {name for line in lines for name in line.split(", ")}
 
 
