@@ -11,7 +11,7 @@ from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
-from acwm_core.recipe.metrics import MetricConfig, class_of_library, metric_configs
+from acwm_core.recipe.metrics import LIBRARY_CLASS, MetricConfig, class_of_library, metric_configs
 from acwm_core.recipe.objective import INHERITED, resolved, with_current_sections
 from acwm_core.recipe.signature import REQUIRED, Signature, signature
 from acwm_core.renamed import without_removed
@@ -135,6 +135,8 @@ def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> d
     """
     registered, dot, _ = metric.partition(".")
     component = catalog().component("metric", registered)
+    if dot and LIBRARY_CLASS not in _signature_of(component).parameters:
+        raise RecipeError(f"{where}: {registered!r} is a metric itself, so there is no {metric}")
     if dot:
         takes = signature(class_of_library(metric))
         # What it passes on to its base class is about processes, not about what is measured.

@@ -12,6 +12,9 @@ from typing import Any, cast
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import catalog
 
+LIBRARY_CLASS = "metric_class"
+"""The parameter of a registered library of metrics that chooses one of its classes."""
+
 MetricChoice = str | Mapping[str, Any]
 """A registered name, or the dotted name of a class whose library is a registered name. Or a mapping
 with that as ``name``, optionally ``as`` (the name in the results), and the metric's parameters.
@@ -34,7 +37,7 @@ class MetricConfig:
             MissingExtraError: its library is not installed.
         """
         registered, dot, _ = self.component.partition(".")
-        of_library = {"metric_class": self.component} if dot else {}
+        of_library = {LIBRARY_CLASS: self.component} if dot else {}
         return catalog().create("metric", registered, **of_library, **self.params)
 
 

@@ -108,7 +108,10 @@ class Recipe:
 
 
 def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe, apply overrides to it and check everything, without importing torch.
+    """Read a recipe, apply overrides to it and check everything.
+
+    Names, sections and the values of `training`, `data` and `evaluation` are checked first, at
+    once; then the parameters of the components, which are imported for it.
 
     Args:
         recipe: a path, or the name of a packaged recipe such as ``push_cube_small``.

@@ -120,6 +120,7 @@ WRONG = {
     "evaluation.metrics=[torchmetrics.image.VisualInformation]": (
         "there is no torchmetrics.image.VisualInformation; did you mean 'VisualInformationFidelity'"
     ),
+    "evaluation.metrics=[psnr.image.PSNR]": "'psnr' is a metric itself, so there is no psnr.image",
     'evaluation.metrics=[{"name":"torchmetrics.image.VisualInformationFidelity","sigma":1}]': (
         "VisualInformationFidelity has no parameter 'sigma'; did you mean 'sigma_n_sq'?"
     ),
