@@ -155,7 +155,10 @@ def decay_at(step: int, decay: float) -> float:
 
 @torch.no_grad()
 def update_average(averaged: WorldModel, world_model: WorldModel, decay: float) -> None:
-    """average ← decay · average + (1 − decay) · weights, in place; buffers are copied."""
+    """average ← decay · average + (1 − decay) · weights, in place; buffers are copied.
+
+    Lightning's `WeightAveraging` copies the module with its codec, which sharded weights refuse.
+    """
     for name in ("model", "conditioner"):
         mean: nn.Module = getattr(averaged, name)
         current: nn.Module = getattr(world_model, name)

@@ -1,4 +1,4 @@
-"""One task in isolation: noise, gradients, parameter groups, batches of video and of latents."""
+"""The training module in isolation: noise, gradients, parameter groups, batches of either kind."""
 
 from types import SimpleNamespace
 
@@ -21,24 +21,24 @@ def test_noise_depends_on_every_part_of_its_key_and_on_nothing_else():
 
 
 def test_video_batches_are_latents_of_their_codec():
-    task = TrainingModule(tiny_world_model(), TrainingConfig())
+    module = TrainingModule(tiny_world_model(), TrainingConfig())
     video = torch.randint(0, 256, (2, 9, 3, 16, 16), dtype=torch.uint8)
-    expected = task.world_model.codec.encode(video.float() / 255)
-    assert torch.equal(task.latents({"video": video}), expected)
-    assert torch.equal(task.latents({"latents": expected}), expected)
+    expected = module.world_model.codec.encode(video.float() / 255)
+    assert torch.equal(module.latents({"video": video}), expected)
+    assert torch.equal(module.latents({"latents": expected}), expected)
 
 
 def parts_seen(steps, monkeypatch, **training):
     """First and last latent frame of 28 that reach the loss in some of 100 steps."""
-    task = TrainingModule(tiny_world_model(), TrainingConfig(**training))
-    codec = task.world_model.codec
+    module = TrainingModule(tiny_world_model(), TrainingConfig(**training))
+    codec = module.world_model.codec
     stride, seen = codec.temporal_stride, []
     monkeypatch.setattr(
-        task.world_model,
+        module.world_model,
         "loss",
         lambda *given: seen.append(given) or given[0].clone().requires_grad_(),
     )
-    monkeypatch.setattr(task, "log", lambda *_, **__: None)
+    monkeypatch.setattr(module, "log", lambda *_, **__: None)
     optimizer = SimpleNamespace(param_groups=[{"lr": 0.1}])
     counted = torch.arange(28.0).reshape(1, 28, 1, 1, 1)
     rows = torch.arange(1.0 + 27 * stride)
@@ -48,10 +48,10 @@ def parts_seen(steps, monkeypatch, **training):
         "positions": [0, 1],
     }
     for step in steps:
-        task._trainer = SimpleNamespace(
+        module._trainer = SimpleNamespace(
             global_step=step, max_steps=100, accumulate_grad_batches=1, optimizers=[optimizer]
         )
-        task.training_step(batch, 0)
+        module.training_step(batch, 0)
     found = []
     for latents, actions, _ in seen:
         first, last = int(latents[0, 0].max()), int(latents[0, -1].max())
@@ -92,16 +92,16 @@ class Recorder(L.Callback):
         if len(self.history) <= trainer.global_step:
             self._keep(pl_module)
 
-    def _keep(self, task):
+    def _keep(self, module):
         self.history.append(
-            {n: w.double().clone() for n, w in task.world_model.state_dict().items()}
+            {n: w.double().clone() for n, w in module.world_model.state_dict().items()}
         )
 
 
 @pytest.mark.parametrize("accumulated", [1, 2])
 def test_training_averages_once_per_optimiser_step(accumulated, tmp_path):
     """Against eₙ = dₙ·eₙ₋₁ + (1 − dₙ)·wₙ with dₙ = min(d, (1 + n)/(10 + n)), in float64."""
-    task = TrainingModule(tiny_world_model(), TrainingConfig(learning_rate=1e-2, ema_decay=0.4))
+    module = TrainingModule(tiny_world_model(), TrainingConfig(learning_rate=1e-2, ema_decay=0.4))
     recorder = Recorder()
     trainer = L.Trainer(
         max_steps=5,
@@ -122,13 +122,13 @@ def test_training_averages_once_per_optimiser_step(accumulated, tmp_path):
         }
         for number in range(10)
     ]
-    trainer.fit(task, DataLoader(batches, batch_size=None))
+    trainer.fit(module, DataLoader(batches, batch_size=None))
     assert len(recorder.history) == 6
     expected = dict(recorder.history[0])
     for n, weights in enumerate(recorder.history[1:], start=1):
         decay = min(0.4, (1 + n) / (10 + n))
         expected = {k: decay * e + (1 - decay) * weights[k] for k, e in expected.items()}
-    for name, value in task.averaged.state_dict().items():
+    for name, value in module.averaged.state_dict().items():
         torch.testing.assert_close(value.double(), expected[name], rtol=1e-5, atol=1e-6)
 
 
@@ -153,12 +153,12 @@ def test_decay_spares_vectors_and_embeddings():
 
 
 def test_checkpoints_without_the_codec_load_and_others_do_not():
-    task = TrainingModule(tiny_world_model(seed=1), TrainingConfig())
-    checkpoint = {"state_dict": task.state_dict()}
-    task.on_save_checkpoint(checkpoint)
+    module = TrainingModule(tiny_world_model(seed=1), TrainingConfig())
+    checkpoint = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(checkpoint)
     other = TrainingModule(tiny_world_model(seed=2), TrainingConfig())
     other.load_state_dict(checkpoint["state_dict"])
-    assert torch.equal(other.world_model.model.enter.weight, task.world_model.model.enter.weight)
+    assert torch.equal(other.world_model.model.enter.weight, module.world_model.model.enter.weight)
     del checkpoint["state_dict"]["averaged.model.enter.weight"]
     with pytest.raises(RuntimeError, match=r"averaged\.model\.enter\.weight"):
         other.load_state_dict(checkpoint["state_dict"])
