@@ -2,6 +2,7 @@
 
     python benchmarks/learning.py --out runs/learning
     python benchmarks/learning.py --out runs/learning --recipe reacher --only Muon --seeds 3
+    python benchmarks/learning.py --out runs/learning --recipe push_cube --only shortcut
 
 Every variant is a recipe and a few overrides; `base` is the small recipe before this study improved
 it. Each variant trains in one thread for as many steps as fit into the budget, measured by a short
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from learning_variants import COMMON, VARIANTS
+from learning_variants import VARIANTS, overrides
 from rich.console import Console
 from rich.table import Table
 
@@ -85,7 +86,7 @@ class Study:
     def words(self, recipe: str, variant: str) -> list[str]:
         """The command line arguments of a variant."""
         place = f"data.path={self.data(recipe)}"
-        return [f"recipes/{recipe}.yaml", "+small", *COMMON, *VARIANTS[variant], place]
+        return [f"recipes/{recipe}.yaml", "+small", *overrides(variant), place]
 
     def steps(self, recipe: str, variant: str) -> int:
         """Steps that fit into the budget, by the CPU time per step without the start-up."""
@@ -125,7 +126,7 @@ class Study:
 
 def same_cost(variant: str) -> str:
     """The first variant whose steps cost the same, as losses and learning rates cost nothing."""
-    free = ("flow.prediction", "flow.loss_on", "flow.shift", "flow.weighting")
+    free = ("objective.prediction", "objective.loss_on", "objective.shift", "objective.weighting")
     costly = {
         name: {word for word in own if not word.startswith((*free, "training.learning_rate"))}
         for name, own in VARIANTS.items()
