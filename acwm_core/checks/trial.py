@@ -21,7 +21,7 @@ Module = TypeVar("Module", bound=nn.Module)
 SMALL = 64
 """Frame height at which episodes are simulated, if the aspect ratio allows it."""
 
-BEGINNING = 48
+BEGINNING = 32
 """Number of frames of episodes that are simulated repeatedly, if the horizon is longer."""
 
 

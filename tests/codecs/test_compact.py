@@ -20,10 +20,10 @@ def codec():
 
 
 def simulated_video(size, split, index, name="push_cube"):
-    """A fresh episode of a seed that no training used, `[1, T, 3, H, W]`."""
+    """The beginning of an episode of a seed that no training used, `[1, T, 3, H, W]`."""
     environment = catalog().create("environment", name, size=size)
     spec = EpisodeSpec(name, split, index, seed=12345, options={"size": size})
-    video = torch.from_numpy(simulate(environment, spec).video)
+    video = torch.from_numpy(simulate(environment, spec, frames=37).video)
     return video.permute(0, 3, 1, 2)[None].float() / 255
 
 
@@ -46,8 +46,8 @@ def test_folding_keeps_every_frame_exactly():
 )
 def test_shipped_weights_reconstruct_scenes_they_never_saw(codec, name, size, split, decibels):
     errors = []
-    for index in range(2):
-        video = simulated_video(size, split, index, name)[:, :37]
+    for index in range(2 if size == 64 else 1):
+        video = simulated_video(size, split, index, name)
         with torch.inference_mode():
             errors.append((codec(video) - video).square().mean().item())
     assert -10 * math.log10(sum(errors) / len(errors)) > decibels

@@ -31,11 +31,9 @@ def start(environment, index, amount):
 def test_an_amount_of_one_is_a_millimetre_or_a_milliradian(name):
     environment = make_environment(name, {"size": 64})
     assert environment.can_be_perturbed
+    starts = [[start(environment, k, amount) for amount in (0.0, 1.0)] for k in range(2)]
     for field in MOVED[name]:
-        moves = [
-            np.ravel(start(environment, index, 1.0)[field] - start(environment, index, 0.0)[field])
-            for index in range(2)
-        ]
+        moves = [np.ravel(moved[field] - usual[field]) for usual, moved in starts]
         size = np.sqrt(np.mean(np.concatenate(moves) ** 2))
         assert 1e-4 < size < 3e-3, field
 

@@ -75,7 +75,7 @@ def test_fewer_particles_than_recorded_repeat(unseen):
 
 
 def test_masks_show_everything():
-    env = PourWater()
+    env = PourWater(size=128)
     frame, info = start(env)
     shown = {k: (info["mask"] == k).sum() for k in (CUP_ID, CONTAINER_ID, WATER_ID, HOLDER_ID)}
     assert min(shown.values()) > 100

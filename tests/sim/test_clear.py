@@ -128,7 +128,9 @@ def shown(scene, k):
     return scene.render(places, np.tile(UPRIGHT, (3, 1, 1)))
 
 
-@pytest.mark.parametrize("size", [(64, 64), (120, 88), (130, 130)])
+@pytest.mark.parametrize(
+    "size", [pytest.param((64, 64), marks=pytest.mark.slow), (120, 88), (130, 130)]
+)
 def test_a_frame_does_not_depend_on_the_frames_before(size):
     used = everything(size)
     for k in (0, 1, 2, 1, 0):

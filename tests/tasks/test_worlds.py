@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from acwm_core.evaluation.score import estimator_for
-from acwm_core.plugins import catalog
-from tests.tasks.playing import begin, like, make, seen, solve, spec_of
+from tests.tasks.playing import begin, like, make, seen, solve
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pybullet")
@@ -40,25 +39,14 @@ def test_the_solution_succeeds_and_comes_nearer(name):
 
 
 @every
-def test_the_goal_is_that_of_the_episode(name):
+def test_another_episode_has_another_goal(name):
+    """That the same one has the same goal, and starts as without it, is what its checks try."""
     env = made(name)
-    frame, info = begin(env)
+    begin(env)
     goal = env.goal
     begin(env, 1)
     assert not np.array_equal(env.goal.frame, goal.frame)
-    again, info = begin(env)
-    np.testing.assert_array_equal(again, frame)
-    np.testing.assert_array_equal(env.goal.frame, goal.frame)
-    np.testing.assert_array_equal(env.goal.mask, goal.mask)
-    for field, values in goal.state.items():
-        np.testing.assert_array_equal(env.goal.state[field], values)
-    bare = catalog().create("environment", env.environment.card.name, size=64)
-    usual, bare_info = bare.reset(options={"spec": spec_of(env)})
-    np.testing.assert_array_equal(frame, usual)
-    for field, values in bare_info["state"].items():
-        np.testing.assert_array_equal(info["state"][field], values)
     env.close()
-    bare.close()
 
 
 TOLD = {
