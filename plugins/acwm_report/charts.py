@@ -13,8 +13,9 @@ import numpy as np
 from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.evaluation.results import Counterfactual, Summary
 from acwm_report.figures import Chart, Curve, Numbers
-from acwm_report.run import ROWS, EvaluatedRun
-from acwm_report.score_grid import Scale, described, split_title
+from acwm_report.run import EvaluatedRun, described
+from acwm_report.table import Scale
+from acwm_report.titles import ROWS, split_title
 from acwm_severity.curves import SeverityCurve, read_severity
 
 SECONDS = "seconds after the first frame"

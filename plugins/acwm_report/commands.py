@@ -1,20 +1,72 @@
-"""`acwm report`, `compare` and `leaderboard`: show evaluated runs and compare them."""
+"""`acwm evaluate`, `report`, `compare` and `leaderboard`."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
-from acwm_core.cli.arguments import FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_report.terminal import print_severity, print_summary
 
-if TYPE_CHECKING:
-    from rich.console import Console
 
-    from acwm_report.comparison import Comparison, Difference
+@click.command()
+@click.argument("run", type=RUN)
+@click.argument("overrides", nargs=-1)
+@click.option("--data", type=DATASET, help="Dataset; by default the training dataset.")
+@click.option(
+    "--protocol",
+    metavar="NAME",
+    help="full (whole episodes) or one of `acwm list protocol`; the recipe's by default.",
+)
+@click.option(
+    "--out",
+    type=OUT_FOLDER,
+    help="Folder to write to instead of RUN; reports accept it like a run.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace a result with other settings.")
+@click.option(
+    "--sweep",
+    "sweeps",
+    multiple=True,
+    metavar="factors.NAME=VALUES",
+    help="Evaluate only the error against a factor: factors.friction=0.1..1.2, "
+    "factors.cube_count=1..5 or factors.light=noon,evening. Simulates what it needs.",
+)
+def evaluate(
+    run: Path,
+    overrides: tuple[str, ...],
+    data: Path | None,
+    protocol: str | None,
+    sweeps: tuple[str, ...],
+    **where: Any,
+) -> None:
+    """Evaluate the model of RUN on test clips.
+
+    Scores in and out of distribution, with reference rows such as the noise floor, and, if the
+    recipe sets them, action responses and the predictability horizon. Writes RUN/evaluation:
+    episodes.parquet, summary.json and videos. OVERRIDES change the settings: evaluation.steps=10
+    evaluation.episodes=32.
+    """
+    from acwm_core.recipe import compose
+
+    if protocol:
+        overrides = (*overrides, f"evaluation.protocol={protocol}")
+    if overrides:  # report misspelt ones before torch is imported
+        compose(run / "recipe.yaml", overrides)
+
+    if sweeps:
+        from acwm_severity.sweep import sweep_severity
+
+        for curve in sweep_severity(run, sweeps, data=data, overrides=overrides, **where):
+            print_severity(curve)
+        return
+
+    from acwm_core.evaluation.evaluate import evaluate_run
+
+    print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
+    click.echo(f"next: acwm report {where['out'] or run}")
 
 
 @click.command()
@@ -32,7 +84,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     and LaTeX, and the figures as PNG and PDF.
     """
     from acwm_experiment.table import Experiment, is_experiment
-    from acwm_report.run import evaluated_runs
+    from acwm_report.experiment import evaluated_runs
 
     found: list[Path] = []
     for run in runs:
@@ -64,24 +116,11 @@ def compare(
     Compares every pair of runs on common clips with a paired bootstrap over episodes. p-values are
     corrected for the number of comparisons (Holm).
     """
-    from rich.console import Console
-
     from acwm_report.comparison import compare_runs
+    from acwm_report.terminal import print_comparison
 
     comparison = compare_runs(runs, metrics=metrics, splits=splits)
-    # A, B … Z, then A1, B1 …, because run names are too long for a table in a terminal
-    letters = {run: f"{chr(65 + n % 26)}{n // 26 or ''}" for n, run in enumerate(comparison.runs)}
-    for label, letter in letters.items():
-        click.echo(f"{letter}: {label}")
-    print_tables(Console(highlight=False, markup=False), comparison, letters)
-    click.echo(
-        "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
-        "which the second is better; p is corrected for "
-        f"{comparison.tests} comparisons (Holm); better: significantly, p < 0.05"
-    )
-    print_uses(Console(highlight=False, markup=False), comparison, letters)
-    for warning in comparison.warnings:
-        click.echo(f"warning: {warning}", err=True)
+    print_comparison(comparison)
     if out:
         comparison.write(out)
         click.echo(out)
@@ -102,61 +141,3 @@ def leaderboard(folder: Path, out: Path | None) -> None:
     for name, why in found.broken.items():
         click.echo(f"left out {name}: {why}", err=True)
     click.echo(page)
-
-
-def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
-    """Print a table per split; on a narrow terminal, long names and intervals wrap."""
-    from rich.table import Table
-
-    if not console.is_terminal:  # a file or a pipe has no width: a line per comparison
-        console.width = 10_000
-    for split in dict.fromkeys(each.split for each in comparison.differences):
-        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=split)
-        table.title_justify, table.title_style = "left", "bold"
-        table.add_column("metric", overflow="fold")
-        table.add_column("runs", no_wrap=True)
-        table.add_column("difference", justify="right", no_wrap=True)
-        table.add_column("95 %", justify="right", overflow="fold")
-        for name in ("wins", "p"):
-            table.add_column(name, justify="right", no_wrap=True)
-        table.add_column("better", no_wrap=True)
-        for each in comparison.differences:
-            if each.split == split:
-                table.add_row(*_line(each, comparison.units[each.metric], letters))
-        console.print(table)
-
-
-def print_uses(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
-    """Print rankings and plans, if there are any: a row per task and measure, a column per run."""
-    from rich.table import Table
-
-    from acwm_report.uses import use_table
-
-    found = use_table(comparison.uses, [*comparison.runs])
-    if found is None:
-        return
-    if not console.is_terminal:
-        console.width = 10_000
-    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=found.title)
-    table.title_justify, table.title_style = "left", "bold"
-    table.add_column("", overflow="fold")
-    for row in found.rows:
-        table.add_column(letters[row.title], justify="right", overflow="fold")
-    for place, column in enumerate(found.columns):
-        title = f"{column.group}, {column.title.lower()} {column.better} {column.unit}"
-        cells = (row.cells[place] for row in found.rows)
-        values = (f"{c.text} ({c.interval})" if c.interval else c.text for c in cells)
-        table.add_row(" ".join(title.split()), *values)
-    console.print(table)
-
-
-def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:
-    pair = f"{letters[each.first]} → {letters[each.second]}"
-    change = f"{each.difference:+.3g} {unit}".strip().replace("inf", "∞").replace("+nan", "–")
-    known = each.low is not None and each.high is not None
-    interval = f"{each.low:+.3g} to {each.high:+.3g}" if known else "–"
-    wins = f"{each.second_better}/{each.episodes}"
-    p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
-    none = "too few" if each.p is None and math.isfinite(each.difference) else "neither"
-    better = letters[each.winner] if each.winner else none
-    return each.metric, pair, change, interval, wins, p, better

@@ -12,18 +12,10 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
-from acwm_report.run import DAMAGE, clips_title
-from acwm_report.score_grid import (
-    Cell,
-    Column,
-    ScoreGrid,
-    compared_metrics,
-    described,
-    model_scores,
-    split_title,
-)
-from acwm_report.score_tables import failures
-from acwm_report.table import Row, Table
+from acwm_report.run import DAMAGE, described
+from acwm_report.scores import ScoreGrid, compared_metrics, failures, model_scores
+from acwm_report.table import Cell, Column, Row, Table
+from acwm_report.titles import clips_title, split_title
 from acwm_report.uses import Use, use_table, uses_of
 
 

@@ -16,16 +16,16 @@ import acwm_core
 from acwm_core.errors import DataError
 from acwm_core.files import writable, written_whole
 from acwm_experiment.table import Experiment
-from acwm_report import charts, plans, rankings, run, tables
+from acwm_report import charts, plans, rankings, tables, titles
 from acwm_report.comparison import run_labels
+from acwm_report.experiment import experiment_tables
+from acwm_report.export import file_name, templates, to_csv, to_latex, to_markdown
 from acwm_report.figures import Chart
-from acwm_report.plan_videos import VideoRoom, plan_videos
+from acwm_report.plan_videos import VideoRoom, plan_videos, task_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
-from acwm_report.score_grid import split_title
-from acwm_report.score_tables import experiment_tables, main_table
-from acwm_report.table import Table, file_name, templates, to_csv, to_latex, to_markdown
-from acwm_report.task_tables import task_tables, task_videos
+from acwm_report.scores import main_table
+from acwm_report.table import Table
 from acwm_report.videos import MEGABYTES, action_traces, embed_videos
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
@@ -100,7 +100,7 @@ def _drawn(
         runs=found,
         all_videos=videos,
         all_plan_videos=plan_videos(found, room),
-        tasks=task_tables(experiment),
+        tasks=plans.task_tables(experiment),
         task_videos=task_videos(experiment, found, room),
         names=_labels(found),
         main=_main_table(found, experiment),
@@ -143,7 +143,7 @@ def _exported(
 ) -> list[Path]:
     found, experiment = _read(runs), experiment and experiment.of_runs(runs)
     made = [_main_table(found, experiment), *_experiment_tables(found, experiment)]
-    made += [*task_tables(experiment), _differences(found)]
+    made += [*plans.task_tables(experiment), _differences(found)]
     written = _export(folder, [each for each in made if isinstance(each, Table)])
     names = _labels(found) if len(found) != 1 else [""]
     for name, each in zip(names, found, strict=True):
@@ -203,14 +203,13 @@ def drawn_page(template: str, **content: Any) -> str:
     made.filters["quote"] = shlex.quote
     made.globals.update(
         action_traces=action_traces,
-        baselines=run.OVER,
-        branch_title=run.branch_title,
+        baselines=titles.OVER,
+        branch_title=titles.branch_title,
         commands_of=commands,
         episode_table=tables.episode_table,
-        label_title=run.label_title,
+        label_title=titles.label_title,
         outdated_curves=charts.outdated_curves,
-        split_title=split_title,
-        verdict_title=run.verdict_title,
+        split_title=titles.split_title,
         version=acwm_core.__version__,
     )
     text: str = made.get_template(template).render(**content)

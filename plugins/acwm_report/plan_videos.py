@@ -11,14 +11,15 @@ from pathlib import Path
 from markupsafe import Markup
 
 from acwm_core.files import read_json
+from acwm_experiment.table import Experiment
 from acwm_report.plans import distance_scale, plan_results
 from acwm_report.run import EvaluatedRun, result_files
 
 VIDEOS = "videos"
 """Folder of a task's videos: ``RUN/planning/TASK/videos/model-*.mp4``, each beside its curves."""
 
-MOST_VIDEOS, MOST_BYTES = 4, 8_000_000
-"""Most videos per task on a page, and the largest size of one video in bytes."""
+MOST_VIDEOS = 4
+"""Most videos per task on a page."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,20 @@ def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[Plan
         ]
         for run in runs
     ]
+
+
+def task_videos(
+    experiment: Experiment | None, shown: Sequence[EvaluatedRun], room: VideoRoom
+) -> list[tuple[str, list[PlanVideo]]]:
+    """Videos of the model by task, without those that are `shown` with their runs."""
+    found: list[tuple[str, list[PlanVideo]]] = []
+    parents = [run.folder.resolve() for run in shown]
+    for number, plan in enumerate(experiment.plans if experiment else ()):
+        inside = any(plan.folder.resolve().is_relative_to(parent) for parent in parents)
+        if not inside and plan.progress():
+            videos = room.take(plan.folder, plan.folder, plan.task, f"task{number}")
+            found.append((plan.title, videos))
+    return [(title, videos) for title, videos in found if videos]
 
 
 def _video(path: Path) -> bytes:

@@ -1,28 +1,23 @@
-"""Tables of the results of `acwm plan` in a run folder; see `plan_videos` for its videos."""
+"""Tables of the results of `acwm plan`; see `plan_videos` for its videos."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 from acwm_core.evaluation.results import Estimate
 from acwm_core.files import read_json
-from acwm_planning.jobs import PLANS, SUMMARY
+from acwm_experiment.table import Experiment
+from acwm_planning.jobs import PLANS, SUMMARY, PlanningJob
 from acwm_report.run import EvaluatedRun, result_files
-from acwm_report.score_grid import MISSING, Cell, Column, Scale
-from acwm_report.table import Row, Table
-
-PERCENT = Scale(100.0, 0, "%")
-
-COLUMNS = (Column("Solved"), Column("Share", PERCENT.unit, better="↑"))
-"""The first columns of a table of plans; those of distances follow, and `LAST`."""
-
-LAST = (Column("p"), Column("Seconds per decision"))
+from acwm_report.table import MISSING, PERCENT, Cell, Column, Row, Scale, Table
 
 CAPTION = (
     "Intervals of shares are exact (Clopper and Pearson), those of distances bootstrap intervals "
     "over episodes; p is of McNemar’s exact test against the first row."
 )
+
 
 ROWS = {
     "model": ("Planning with the model", "the result; other rows are baselines"),
@@ -91,27 +86,55 @@ def plan_tables(run: EvaluatedRun) -> list[Table]:
     tables: list[Table] = []
     for found in plan_results(run).values():
         scale = distance_scale(found.unit)
-        columns = [
-            *COLUMNS,
-            Column("Final distance", scale.unit, better="↓"),
-            Column("At the start", scale.unit),
-            *LAST,
-        ]
-        rows = [plan_row(each, scale) for each in found.rows]
+        rows = [_row(each, scale) for each in found.rows]
         head = f"{found.task} · {max((each.episodes for each in found.rows), default=0)} episodes"
-        tables.append(Table(head, columns, rows, "Who acts", CAPTION, f"plans-{found.task}"))
+        name = f"plans-{found.task}"
+        tables.append(Table(head, _columns(scale.unit), rows, "Who acts", CAPTION, name))
     return tables
 
 
-def plan_row(found: PlannedRow, scale: Scale) -> Row:
-    """A line of a table with `COLUMNS`, final distance, distance at the start and `LAST`."""
+def task_tables(experiment: Experiment | None) -> list[Table]:
+    """A table for each of the experiment's tables of tasks: all that act, world by world.
+
+    Tasks of which no episode is played are named below; a table of such tasks alone is left out.
+    """
+    tables: list[Table] = []
+    plans = experiment.plans if experiment else ()
+    for title, group in groupby(plans, key=lambda plan: plan.table):
+        tasks = [*group]
+        made = [plan for plan in tasks if plan.progress()]
+        caption = "" if experiment is None or experiment.cells else experiment.caption
+        missing = ", ".join(plan.row for plan in tasks if plan not in made)
+        words = (caption, CAPTION, missing and f"Not played yet: {missing}.")
+        rows = [row for plan in made for row in _task_rows(plan)]
+        if rows:
+            text = " ".join(filter(None, words))
+            tables.append(Table(title, _columns(), rows, "Who acts", text, f"plans-{title}"))
+    return tables
+
+
+def _task_rows(plan: PlanningJob) -> list[Row]:
+    found = read_json(plan.folder / SUMMARY, PlanTable, "a table of plans")
+    scale, group = distance_scale(found.unit), f"{plan.row} · {plan.task}"
+    asked = [each for each in found.rows if each.row in plan.rows]
+    return [replace(_row(each, scale, scale.unit), group=group) for each in asked]
+
+
+def _columns(unit: str = "") -> list[Column]:
+    """The columns of a table of plans; without a `unit` of distances, each cell has its own."""
+    solved = Column("Solved"), Column("Share", PERCENT.unit, better="↑")
+    distances = Column("Final distance", unit, better="↓"), Column("At the start", unit)
+    return [*solved, *distances, Column("p"), Column("Seconds per decision")]
+
+
+def _row(found: PlannedRow, scale: Scale, unit: str = "") -> Row:
     title, note = ROWS.get(found.row, (found.row, ""))
+    distances = (Cell.of(each, scale) for each in (found.distance, Estimate(found.start_distance)))
     seconds = found.seconds_per_decision
     cells = [
         Cell(f"{found.successes}/{found.episodes}", value=found.successes),
         Cell.of(found.success, PERCENT),
-        Cell.of(found.distance, scale),
-        Cell.of(Estimate(found.start_distance), scale),
+        *(replace(cell, text=f"{cell.text} {unit}".strip()) for cell in distances),
         Cell(MISSING if found.p is None else f"{found.p:.2g}", value=found.p),
         Cell(MISSING if seconds is None else f"{seconds:.2g}", value=seconds),
     ]

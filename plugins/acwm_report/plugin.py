@@ -1,14 +1,14 @@
-"""Register the commands that report and compare evaluated runs."""
+"""Register the commands that evaluate, report and compare runs."""
 
 from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add `acwm report`, `acwm compare` and `acwm leaderboard`."""
+    """Add `acwm evaluate`, `acwm report`, `acwm compare` and `acwm leaderboard`."""
     registry.add(
         "evaluate",
-        "acwm_report.evaluate:evaluate",
+        "acwm_report.commands:evaluate",
         summary="measure how good a trained model is",
         after="import-checkpoint",
     )

@@ -8,16 +8,13 @@ from acwm_core.files import read_json
 from acwm_planning.policies.ranking import FILE, FOLDER, Ranking
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun, result_files
-from acwm_report.score_grid import Cell, Column, Scale
-from acwm_report.table import Row, Table
+from acwm_report.table import PLAIN, Cell, Column, Row, Table
 
 JUDGES = {
     "model": ("Model", "what an estimator reads in its predictions"),
     "estimator": ("Estimator alone", "what it reads in the true pictures: the ceiling"),
 }
 """Title and explanation of each judge that scores policies."""
-
-_PLAIN = Scale(1.0, 2, "")
 
 
 def rankings(run: EvaluatedRun) -> list[Ranking]:
@@ -46,8 +43,8 @@ def ranking_tables(run: EvaluatedRun) -> list[Table]:
         for judge, (title, note) in JUDGES.items():
             for score, by in found.agreement[judge].items():
                 values = by.pearson, by.spearman, by.kendall, by.mmrv
-                cells = [Cell.of(value, _PLAIN) for value in values]
-                cells.append(Cell.of(by.optimism, _PLAIN, signed=True))
+                cells = [Cell.of(value, PLAIN) for value in values]
+                cells.append(Cell.of(by.optimism, PLAIN, signed=True))
                 what = "success" if score == "success" else "return"
                 rows.append(Row(f"{title}, {what}", cells, note, strong=judge == "model"))
         choices = found.decisions.get("model")

@@ -1,4 +1,4 @@
-"""Evaluated runs as a report reads them, and the words for their parts."""
+"""Evaluated runs as a report reads them."""
 
 from __future__ import annotations
 
@@ -13,56 +13,11 @@ from jinja2 import TemplateError
 from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.evaluation.results import Estimate, MetricInfo, Score, SetSummary, Summary
 from acwm_core.evaluation.storage import read_scores
-from acwm_experiment.table import SUMMARY, Experiment
-from acwm_report.score_grid import Scale, described
+from acwm_core.plugins import catalog
+from acwm_report.table import Scale
+from acwm_report.titles import OVER
 
 Made = TypeVar("Made")
-
-ROWS = {
-    "truth": ("True video", "the noise floor: the error of the estimator of states"),
-    "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
-    "perturbed": ("Simulator, perturbed", "started a millimetre off; few clips"),
-    "model": ("Model, true actions", "what is being evaluated"),
-    "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
-    "copy": ("First frame, copied", "a prediction in which nothing moves"),
-}
-"""Title and explanation of every row of an evaluation, in table order."""
-
-BESIDE = {
-    "model": "Model",
-    "truth": "Noise floor",
-    "codec": "Codec",
-    "perturbed": "Perturbed",
-    "shuffled": "Other actions",
-    "copy": "First frame",
-}
-"""Short titles of the rows where they are table columns: the scores first, then their floors."""
-
-OVER = {"copy": "the copied first frame", "shuffled": "other actions"}
-"""The baselines that a model is compared with on each clip."""
-
-BRANCHES = {
-    "factual": "Its own actions",
-    "another": "Another episode’s actions",
-    "still": "Nothing is moved",
-    "reversed": "Actions reversed in time",
-    "mirrored": "Actions mirrored",
-}
-"""Titles of counterfactual branches; all other branches shift one action dimension."""
-
-
-def evaluated_runs(folder: str | Path) -> list[Path]:
-    """The evaluated runs of the experiment in a folder; there may be none if it has plans.
-
-    Raises:
-        DataError: the folder holds no experiment, or one without any result.
-    """
-    experiment = Experiment.read(folder)
-    runs = [run for cell in experiment.cells for run in cell.runs]
-    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
-    if not found and not any(plan.progress() for plan in experiment.plans):
-        raise DataError(f"no run of {folder} is evaluated yet")
-    return [*found]
 
 
 @dataclass(frozen=True)
@@ -76,11 +31,7 @@ class EvaluatedRun:
 
     @classmethod
     def read(cls, folder: Path, key: str) -> EvaluatedRun:
-        """Read an evaluated run from its folder.
-
-        Raises:
-            DataError: there is no such run, or it was not evaluated.
-        """
+        """Read an evaluated run from its folder."""
         summary = Summary.read(folder)
         summary = replace(summary, metrics=described(summary.metrics))
         return cls(folder, summary, read_scores(folder), key)
@@ -110,6 +61,21 @@ class EvaluatedRun:
             ends = (was.value, *(was.low, was.high)[::sign])
             found[each] = Estimate(*(None if end is None else sign * end for end in ends))
         return found
+
+    @property
+    def verdict(self) -> str:
+        """Whether the model beats both baselines, by the intervals of the first split."""
+        gains = self.gains(next(iter(self.summary.splits.values())).scores)
+        if all(gain.low is None for gain in gains.values()):
+            return "Too few episodes for a verdict"
+        predicts, conditioned = ((gains[each].low or 0) > 0 for each in ("copy", "shuffled"))
+        if predicts and conditioned:
+            return "Action-conditioned prediction"
+        if conditioned:
+            return "Action-conditioned, but no better than a still frame"
+        if predicts:
+            return "Better than a still frame, but action-insensitive"
+        return "No better than a still frame, and action-insensitive"
 
     def metrics(self, reads: str) -> list[str]:
         """Names of the metrics that read ``"pixels"``, or those that read ``"states"``."""
@@ -178,34 +144,23 @@ def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:
     return [EvaluatedRun.read(Path(run), f"run{n}") for n, run in enumerate(folders, start=1)]
 
 
-def label_title(label: str | None) -> str:
-    """A label in words: ``cube count 5 + friction`` for ``cube_count=5+friction``."""
-    return (label or "").replace("_", " ").replace("=", " ").replace("+", " + ")
+def described(metrics: Mapping[str, MetricInfo]) -> dict[str, MetricInfo]:
+    """Metrics with all the facts that tables need.
+
+    Old results hold only the unit; the rest is taken from the metric registered under the name, if
+    there is one.
+    """
+    return {name: info if info.title else _looked_up(name, info) for name, info in metrics.items()}
 
 
-def branch_title(name: str) -> str:
-    """The title of a counterfactual branch."""
-    return BRANCHES.get(name, f"{name.replace('_', ' ')} shifted")
-
-
-def clips_title(scores: SetSummary) -> str:
-    """The number of clips in words: ``12 episodes``, or ``120 clips of 12 episodes``."""
-    if scores.episodes in (0, scores.clips):
-        return f"{scores.clips} episodes"
-    return f"{scores.clips} clips of {scores.episodes} episodes"
-
-
-def verdict_title(run: EvaluatedRun) -> str:
-    """One line on whether the model beats both baselines, by the intervals of the first split."""
-    scores = next(iter(run.summary.splits.values())).scores
-    gains = run.gains(scores)
-    if all(gain.low is None for gain in gains.values()):
-        return "Too few episodes for a verdict"
-    predicts, conditioned = ((gains[each].low or 0) > 0 for each in ("copy", "shuffled"))
-    if predicts and conditioned:
-        return "Action-conditioned prediction"
-    if conditioned:
-        return "Action-conditioned, but no better than a still frame"
-    if predicts:
-        return "Better than a still frame, but action-insensitive"
-    return "No better than a still frame, and action-insensitive"
+def _looked_up(name: str, info: MetricInfo) -> MetricInfo:
+    try:
+        asked = catalog().component("metric", name).load()
+    except (AcwmError, ImportError):
+        asked = info
+    known = {
+        each: getattr(asked, each, getattr(info, each))
+        for each in ("title", "group", "reads", "factor", "rank")
+    }
+    words = name.upper().replace("_", "-") if len(name) <= 5 else name.replace("_", " ")
+    return replace(info, **{**known, "title": known["title"] or words[0].upper() + words[1:]})

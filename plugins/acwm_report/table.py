@@ -1,17 +1,105 @@
-"""Tables as data with scaled numbers, and their export to CSV, Markdown and LaTeX."""
+"""Tables as data: numbers as they are written, columns, rows."""
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
-import re
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from acwm_core.evaluation.results import Estimate, MetricInfo
 
-from acwm_report.score_grid import INFINITE, MINUS, MISSING, Cell, Column
+MINUS, MISSING, INFINITE = "−", "–", "∞"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How the numbers of one metric are written."""
+
+    factor: float  # numbers are multiplied by it
+    decimals: int  # digits after the decimal point
+    unit: str  # ``"dB"``, ``"mm"`` (for metres), ``"×10⁻³"`` or ``""``
+
+    @classmethod
+    def of(cls, values: Iterable[float | None], info: MetricInfo) -> Scale:
+        """One scale for numbers shown together: three or four significant digits of the largest.
+
+        Metres become millimetres. Numbers without unit or factor become thousandths if all are
+        small.
+        """
+        finite = (abs(v) for v in values if v is not None and math.isfinite(v))
+        largest = max(finite, default=1.0)
+        factor, unit = info.factor, info.unit
+        if unit == "m":
+            factor, unit = 1000.0, "mm"
+        elif factor is None:
+            factor = 1000.0 if not unit and 0 < largest < 0.1 else 1.0
+        magnitude = math.floor(math.log10(largest * factor)) if largest else 0
+        unit = unit or ("×10⁻³" if factor == 1000.0 else "")
+        return cls(factor, min(3, max(0, 3 - magnitude)), unit)
+
+    def number(self, value: float | None, *, signed: bool = False) -> str:
+        """``24.31``, or ``+3.10`` and ``−0.42`` if signed."""
+        if value is None:
+            return MISSING
+        text = f"{abs(value) * self.factor:.{self.decimals}f}"
+        is_negative = value < 0 and float(text)
+        text = text.replace("inf", INFINITE)
+        return MINUS + text if is_negative else f"+{text}" if signed else text
+
+    def interval(self, estimate: Estimate, *, signed: bool = False) -> str:
+        """``24.0 to 24.6``; empty without an interval."""
+        if estimate.low is None or estimate.high is None:
+            return ""
+        low, high = (self.number(v, signed=signed) for v in (estimate.low, estimate.high))
+        return f"{low} to {high}"
+
+
+PLAIN = Scale(1.0, 2, "")
+"""The scale of numbers without a unit."""
+
+PERCENT = Scale(100.0, 0, "%")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number with its interval in small print below it."""
+
+    text: str  # the number as displayed
+    interval: str = ""  # its 95 % confidence interval as displayed
+    # the number itself, neither scaled nor rounded; None for text and gaps
+    value: float | None = None
+    low: float | None = None  # lower end of the interval
+    high: float | None = None  # upper end
+    worse: bool = False  # whether the score is worse out of distribution than in distribution
+    link: str = ""  # id on the page to which the cell links, or empty
+
+    @classmethod
+    def of(
+        cls, number: Estimate | None, scale: Scale, *, signed: bool = False, worse: bool = False
+    ) -> Cell:
+        """A cell for an estimate in this scale; a gap if there is none."""
+        estimate = number or Estimate(None)
+        text = scale.number(estimate.value, signed=signed)
+        interval = scale.interval(estimate, signed=signed)
+        return cls(text, interval, estimate.value, estimate.low, estimate.high, worse)
+
+
+@dataclass(frozen=True)
+class Column:
+    """The head of a column."""
+
+    title: str  # as displayed
+    unit: str = ""  # unit of the displayed numbers, or empty
+    better: str = ""  # direction that is better: ``"↑"``, ``"↓"`` or empty
+    group: str = ""  # common heading of a group of columns
+    # the column's name in CSV, where numbers have the metric's own unit; the title by default
+    key: str = ""
+
+    @classmethod
+    def of(cls, info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
+        """The head of a column of scores."""
+        return cls(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
 
 
 @dataclass(frozen=True)
@@ -49,106 +137,3 @@ class Table:
     def row_groups(self) -> list[tuple[str, list[Row]]]:
         """Each heading with the rows below it."""
         return [(g, list(rows)) for g, rows in itertools.groupby(self.rows, lambda row: row.group)]
-
-
-def to_csv(table: Table) -> str:
-    """Comma-separated values at full precision, with the ends of intervals in their own columns.
-
-    Numbers are in the metrics' own units, not scaled as in the report. Missing values are empty.
-    """
-    grouped = any(row.group for row in table.rows)
-    head = ["group"] * grouped + [table.corner or "row", "note"]
-    lines = [[row.group] * grouped + [row.title, row.note] for row in table.rows]
-    for index, column in enumerate(table.columns):
-        cells = [row.cells[index] for row in table.rows]
-        key = column.key or " ".join(filter(None, (column.group, column.title)))
-        bounded = any(cell.low is not None for cell in cells)
-        head += [key, f"{key}_low", f"{key}_high"] if bounded else [key]
-        for line, cell in zip(lines, cells, strict=True):
-            words = "" if cell.text == MISSING else cell.text
-            line.append(words if cell.value is None else repr(float(cell.value)))
-            ends = (cell.low, cell.high) if bounded else ()
-            line += ["" if end is None else repr(float(end)) for end in ends]
-    file = io.StringIO()
-    inert = ([_no_formula(cell) for cell in line] for line in (head, *lines))
-    csv.writer(file, lineterminator="\n").writerows(inert)
-    return file.getvalue()
-
-
-def _no_formula(cell: str) -> str:
-    """Escape a cell so that no spreadsheet runs it as a formula; numbers stay as they are."""
-    cell = re.sub(r"[\t\r\n]+", " ", cell)
-    if cell[:1] in tuple("=+-@"):
-        try:
-            float(cell)
-        except ValueError:
-            return f"'{cell}"
-    return cell
-
-
-def file_name(text: str) -> str:
-    """Turn text into a file name that never leads to another folder."""
-    return re.sub(r"[^\w+= .-]", "-", text).lstrip(".") or "unnamed"
-
-
-def to_markdown(table: Table) -> str:
-    """A table in GitHub Markdown, with intervals in brackets."""
-    return _rendered("table.md.j2", table)
-
-
-def to_latex(table: Table) -> str:
-    r"""A LaTeX ``tabular`` with booktabs, in the usual layout of papers.
-
-    Intervals are left out; a score that is worse out of distribution has an arrow. Use ``\input``
-    in a document that loads the packages booktabs, multirow and xcolor.
-    """
-    return _rendered("table.tex.j2", table)
-
-
-def templates(**settings: Any) -> Any:
-    """The Jinja environment for the report's templates."""
-    settings |= {"loader": PackageLoader("acwm_report"), "undefined": StrictUndefined}
-    return Environment(trim_blocks=True, lstrip_blocks=True, **settings)
-
-
-def _rendered(template: str, table: Table) -> str:
-    """Render a text template (not HTML). Its delimiters do not clash with LaTeX."""
-    made = templates(
-        keep_trailing_newline=True,
-        block_start_string="<%",
-        block_end_string="%>",
-        variable_start_string="<<",
-        variable_end_string=">>",
-    )
-    made.filters.update(latex=_escaped, pipes=_in_markdown)
-    return made.get_template(template).render(table=table)
-
-
-def _in_markdown(text: str) -> str:
-    return " ".join(text.split()).replace("|", r"\|").replace("<", "&lt;")
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "×": r"$\times$",
-    "⁻³": r"$^{-3}$",
-    MINUS: r"$-$",
-    "≈": r"$\approx$",
-    "·": r"$\cdot$",
-    "°": r"$^\circ$",
-    "Δ": r"$\Delta$",
-    "’": "'",
-    "–": "--",
-    INFINITE: r"$\infty$",
-    "…": r"\ldots{}",
-}
-_SPECIAL = re.compile("|".join(map(re.escape, _LATEX)))
-
-
-def _escaped(text: str) -> str:
-    return _SPECIAL.sub(lambda match: _LATEX[match[0]], text)

@@ -17,19 +17,10 @@ from acwm_core.evaluation.results import (
 )
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
-from acwm_report.run import (
-    BESIDE,
-    ROWS,
-    EvaluatedRun,
-    branch_title,
-    clips_title,
-    label_title,
-)
-from acwm_report.score_grid import MISSING, Cell, Column, Scale, described, split_title
-from acwm_report.table import Row, Table
+from acwm_report.run import EvaluatedRun, described
+from acwm_report.table import MISSING, PLAIN, Cell, Column, Row, Scale, Table
+from acwm_report.titles import BESIDE, ROWS, branch_title, clips_title, label_title, split_title
 from acwm_report.videos import EmbeddedVideo
-
-_PLAIN = Scale(1.0, 2, "")
 
 
 def score_tables(run: EvaluatedRun) -> list[Table]:
@@ -104,9 +95,9 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
         rows: list[Row] = []
         for metric, info in described(named).items():
             for branch, by_row in {"all": found.rows, **found.kinds}.items():
-                cells = [Cell.of(by_row.get(kind, {}).get(metric), _PLAIN) for kind in kinds]
+                cells = [Cell.of(by_row.get(kind, {}).get(metric), PLAIN) for kind in kinds]
                 both = (each.get(branch, {}).get("model") for each in (found.gain, found.residual))
-                gain, rest = map(_PLAIN.number, both)
+                gain, rest = map(PLAIN.number, both)
                 note = f"model: gain {gain}, residual {rest}" if MISSING not in (gain, rest) else ""
                 title = info.title if branch == "all" else branch_title(branch)
                 rows.append(Row(title, cells, note, strong=branch == "all"))

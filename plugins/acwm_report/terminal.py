@@ -1,7 +1,9 @@
-"""Print the scores of an evaluation as tables in the terminal."""
+"""What the commands print: scores, curves, comparisons."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import click
@@ -9,10 +11,12 @@ import click
 from acwm_core.cli.tables import plain_table
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from acwm_core.evaluation.benchmark import PublishedRow
     from acwm_core.evaluation.results import Counterfactual, Estimate, SetSummary, Summary
+    from acwm_report.comparison import Comparison, Difference
     from acwm_severity.curves import SeverityCurve
 
 ROWS = {
@@ -34,7 +38,7 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and published scores for comparison."""
     from rich.console import Console
 
-    from acwm_report.published import about_published
+    from acwm_report.terminal import about_published
 
     console = Console(highlight=False, markup=False)
     for split, result in summary.splits.items():
@@ -142,7 +146,7 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
 
 
 def _published_table(summary: Summary, row: PublishedRow) -> Table:
-    from acwm_report import score_grid as made
+    from acwm_report import scores as made
 
     quoted = " ".join(["published:", row.row, row.column]).strip()
     models = {summary.run: made.model_scores(summary), quoted: made.published_scores(row)}
@@ -156,3 +160,97 @@ def _published_table(summary: Summary, row: PublishedRow) -> Table:
     for name, scores in models.items():
         table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
     return table
+
+
+def about_published(summary: Summary) -> str:
+    """Where the published figures of a run come from and how far they are comparable, as text."""
+    from acwm_core.evaluation.benchmark import published_tables
+
+    if not summary.published:
+        return ""
+    row, same = summary.published.row, summary.published.same_parts
+    setting = ", ".join(str(row.setting[name]) for name in ("model", "codec", "conditioner"))
+    facts = [f"published: {row.citation}, {row.label} ({setting})"]
+    if not same:
+        facts.append("this run has other components")
+    table = published_tables().get(row.table)  # none where its plugin is not installed
+    if table and summary.protocol != table.protocol:
+        facts.append(f"measured on other clips: compare with --protocol {table.protocol}")
+    return "; ".join(facts) + (f". {row.note}" if row.note else "")
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print which runs differ: a table per split, what they are good for, and warnings."""
+    from rich.console import Console
+
+    # A, B … Z, then A1, B1 …, because run names are too long for a table in a terminal
+    letters = {run: f"{chr(65 + n % 26)}{n // 26 or ''}" for n, run in enumerate(comparison.runs)}
+    for label, letter in letters.items():
+        click.echo(f"{letter}: {label}")
+    print_tables(Console(highlight=False, markup=False), comparison, letters)
+    click.echo(
+        "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
+        "which the second is better; p is corrected for "
+        f"{comparison.tests} comparisons (Holm); better: significantly, p < 0.05"
+    )
+    _print_uses(Console(highlight=False, markup=False), comparison, letters)
+    for warning in comparison.warnings:
+        click.echo(f"warning: {warning}", err=True)
+
+
+def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
+    """Print a table per split; on a narrow terminal, long names and intervals wrap."""
+    for split in dict.fromkeys(each.split for each in comparison.differences):
+        table = _wide_table(console, split)
+        table.add_column("metric", overflow="fold")
+        table.add_column("runs", no_wrap=True)
+        table.add_column("difference", justify="right", no_wrap=True)
+        table.add_column("95 %", justify="right", overflow="fold")
+        for name in ("wins", "p"):
+            table.add_column(name, justify="right", no_wrap=True)
+        table.add_column("better", no_wrap=True)
+        for each in comparison.differences:
+            if each.split == split:
+                table.add_row(*_line(each, comparison.units[each.metric], letters))
+        console.print(table)
+
+
+def _print_uses(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
+    """Print rankings and plans, if there are any: a row per task and measure, a column per run."""
+    from acwm_report.uses import use_table
+
+    found = use_table(comparison.uses, [*comparison.runs])
+    if found is None:
+        return
+    table = _wide_table(console, found.title)
+    table.add_column("", overflow="fold")
+    for row in found.rows:
+        table.add_column(letters[row.title], justify="right", overflow="fold")
+    for place, column in enumerate(found.columns):
+        title = f"{column.group}, {column.title.lower()} {column.better} {column.unit}"
+        cells = (row.cells[place] for row in found.rows)
+        values = (f"{c.text} ({c.interval})" if c.interval else c.text for c in cells)
+        table.add_row(" ".join(title.split()), *values)
+    console.print(table)
+
+
+def _wide_table(console: Console, title: str) -> Table:
+    from rich.table import Table
+
+    if not console.is_terminal:  # a file or a pipe has no width: a line per row
+        console.width = 10_000
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=title)
+    table.title_justify, table.title_style = "left", "bold"
+    return table
+
+
+def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:
+    pair = f"{letters[each.first]} → {letters[each.second]}"
+    change = f"{each.difference:+.3g} {unit}".strip().replace("inf", "∞").replace("+nan", "–")
+    known = each.low is not None and each.high is not None
+    interval = f"{each.low:+.3g} to {each.high:+.3g}" if known else "–"
+    wins = f"{each.second_better}/{each.episodes}"
+    p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
+    none = "too few" if each.p is None and math.isfinite(each.difference) else "neither"
+    better = letters[each.winner] if each.winner else none
+    return each.metric, pair, change, interval, wins, p, better

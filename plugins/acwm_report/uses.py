@@ -8,12 +8,9 @@ from itertools import groupby
 from pathlib import Path
 
 from acwm_core.evaluation.results import Estimate, Summary
-from acwm_report.plans import PERCENT, PlanTable, distance_scale, plan_tables_of
+from acwm_report.plans import PlanTable, distance_scale, plan_tables_of
 from acwm_report.rankings import Ranking, rankings_of
-from acwm_report.score_grid import MISSING, Cell, Column, Scale
-from acwm_report.table import Row, Table
-
-PLAIN = Scale(1.0, 2, "")
+from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale, Table
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from acwm_experiment.steps import (
     training_progress,
 )
 from acwm_experiment.table import Experiment
-from acwm_report.run import evaluated_runs
+from acwm_report.experiment import evaluated_runs
 from tests.evaluation import tiny
 
 TABLE = """

@@ -26,7 +26,7 @@ from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run import load_run
 from acwm_phys.protocol import PublishedWindows
-from acwm_report.evaluate import evaluate
+from acwm_report.commands import evaluate
 from tests.evaluation import tiny
 
 REFERENCE = Path(__file__).parent.parent / "reference"

@@ -11,9 +11,8 @@ from click.testing import CliRunner
 from acwm_core.evaluation.benchmark import published_for, published_tables
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
-from acwm_report.evaluate import evaluate
-from acwm_report.published import about_published
-from acwm_report.terminal import print_summary
+from acwm_report.commands import evaluate
+from acwm_report.terminal import about_published, print_summary
 from tests.evaluation import tiny
 
 TABLES = published_tables()

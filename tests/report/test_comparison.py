@@ -10,8 +10,8 @@ from scipy import stats
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
-from acwm_report.commands import print_tables
 from acwm_report.comparison import Comparison, Difference, compare_runs
+from acwm_report.terminal import print_tables
 from tests.report import synthetic
 
 RNG = np.random.default_rng(11)

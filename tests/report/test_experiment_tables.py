@@ -5,9 +5,9 @@ import pytest
 
 from acwm_core.errors import DataError
 from acwm_experiment.table import Experiment, ExperimentCell
+from acwm_report.experiment import experiment_tables
+from acwm_report.export import to_csv, to_latex
 from acwm_report.page import export_report, write_report
-from acwm_report.score_tables import experiment_tables
-from acwm_report.table import to_csv, to_latex
 from tests.report import synthetic
 
 EPISODES = 12

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from acwm_core.cli import main
+from acwm_report.export import to_csv, to_latex, to_markdown
 from acwm_report.page import export_report
-from acwm_report.score_grid import Cell, Column
-from acwm_report.table import Row, Table, to_csv, to_latex, to_markdown
+from acwm_report.table import Cell, Column, Row, Table
 from tests.report import synthetic
 
 DOCUMENT = r"""\documentclass{article}

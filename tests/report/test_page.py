@@ -21,8 +21,8 @@ from acwm_core.evaluation.results import (
 from acwm_core.evaluation.statistics import paired_bootstrap
 from acwm_report.charts import smooth
 from acwm_report.page import write_report
-from acwm_report.run import EvaluatedRun, verdict_title
-from acwm_report.score_grid import Scale
+from acwm_report.run import EvaluatedRun
+from acwm_report.table import Scale
 from acwm_report.videos import action_traces
 from tests.evaluation import tiny
 from tests.report import synthetic
@@ -111,7 +111,7 @@ def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
             assert f"{row['mse'].value * 1000:.2f}" in text
         pair = split.scores.paired["shuffled"]["psnr"]
         assert f"{pair.better}/{pair.clips}" in text
-    assert verdict_title(EvaluatedRun.read(evaluated, "run1")) in text
+    assert EvaluatedRun.read(evaluated, "run1").verdict in text
     assert "colour" in text
     assert summary.provenance["weights_sha256"][:16] in text
 
@@ -179,7 +179,7 @@ def run_of(copy, shuffled):
     ],
 )
 def test_the_verdict_needs_intervals_beyond_zero(copy, shuffled, title):
-    assert verdict_title(run_of(copy, shuffled)) == title
+    assert run_of(copy, shuffled).verdict == title
 
 
 def test_the_verdict_rests_on_the_intervals_of_acwm_compare(tmp_path):
@@ -194,7 +194,7 @@ def test_the_verdict_rests_on_the_intervals_of_acwm_compare(tmp_path):
     test = paired_bootstrap(gains)
     assert (gain.value, gain.low, gain.high) == pytest.approx((test.mean, test.low, test.high))
     assert gain.low < 0
-    assert verdict_title(run) == "Action-conditioned, but no better than a still frame"
+    assert run.verdict == "Action-conditioned, but no better than a still frame"
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,9 @@ import numpy as np
 from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.plugins import Catalog
-from acwm_report import score_grid
-from acwm_report.run import EvaluatedRun
-from acwm_report.score_grid import described
-from acwm_report.score_tables import main_table
+from acwm_report import run as runs
+from acwm_report.run import EvaluatedRun, described
+from acwm_report.scores import main_table
 from acwm_report.tables import score_tables, state_tables
 from tests.report import synthetic
 
@@ -74,7 +73,7 @@ def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monke
     metrics.registering("foreign", None)
     metrics.add("sharpness", f"{__name__}:Sharpness")
     installed = SimpleNamespace(component=lambda kind, name: metrics[name])
-    monkeypatch.setattr(score_grid, "catalog", lambda: installed)
+    monkeypatch.setattr(runs, "catalog", lambda: installed)
     folder = synthetic.run(tmp_path / "run", synthetic.clips(SCORES))
     read = EvaluatedRun.read(folder, "run1")
     rows = read.summary.splits["ind_test"].scores.rows

@@ -9,8 +9,8 @@ from acwm_core.cli import main
 from acwm_core.errors import DataError
 from acwm_experiment.table import Experiment, ExperimentCell
 from acwm_planning.jobs import PlanningJob
+from acwm_report.experiment import evaluated_runs
 from acwm_report.page import export_report, write_report
-from acwm_report.run import evaluated_runs
 from tests.report.test_plans import add_plans, make_run
 
 WEIGHTS = hashlib.sha256(b"weights").hexdigest()

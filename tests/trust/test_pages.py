@@ -16,11 +16,11 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.evaluation.results import Summary, VideoRecord
+from acwm_report.export import file_name, to_csv, to_markdown
 from acwm_report.figures import Chart, Curve
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
-from acwm_report.score_grid import Cell, Column
-from acwm_report.table import Row, Table, file_name, to_csv, to_markdown
+from acwm_report.table import Cell, Column, Row, Table
 from tests.report.synthetic import clips, run
 
 SECRET = "root:x:0:0"

@@ -1,4 +1,4 @@
-"""Tables that compare several models: the main table, and the tables of an experiment."""
+"""The tables of an experiment: mean scores over seeds, and differences between its rows."""
 
 from __future__ import annotations
 
@@ -14,63 +14,27 @@ from acwm_core.evaluation.statistics import ClipScores
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import tabulate
 from acwm_experiment.table import SUMMARY, Experiment
-from acwm_report.run import EvaluatedRun, clips_title
-from acwm_report.score_grid import (
-    CAPTION,
-    Cell,
-    ScoreGrid,
-    compared_metrics,
-    described,
-    model_scores,
-    published_scores,
-    split_title,
-)
+from acwm_report.run import described
+from acwm_report.scores import CAPTION, ScoreGrid, published_scores
 from acwm_report.seeds import difference_over_seeds, over_seeds
-from acwm_report.table import Row, Table
+from acwm_report.table import Cell, Row, Table
 
 Place = tuple[str, str]
 """The row and column of a cell in an experiment."""
 
 
-def failures(summary: Summary) -> list[str]:
-    """A phrase for each split in which predictions of the model are not finite."""
-    found = {s: each.scores.failures() for s, each in summary.splits.items()}
-    return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
+def evaluated_runs(folder: str | Path) -> list[Path]:
+    """The evaluated runs of the experiment in a folder; there may be none if it has plans.
 
-
-def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
-    """One line per run with the published figures below it; None without pixel metrics."""
-    summaries = [run.summary for run in runs]
-    metrics = compared_metrics(summaries)
-    if not metrics:
-        return None
-    quoted = [each.published for each in summaries]
-    models = [model_scores(each) for each in summaries]
-    figures = [published_scores(each.row if each else None) for each in quoted]
-    grid = ScoreGrid.of([*models, *figures], metrics)
-    environments = [each.parts["env"] for each in summaries]
-    rows: list[Row] = []
-    for number, (run, summary) in enumerate(zip(runs, summaries, strict=True)):
-        words = [environments[number].replace("_", " ").title(), summary.run]
-        if environments.count(environments[number]) > 1:
-            words.reverse()
-        clips = {clips_title(each.scores) for each in summary.splits.values()}
-        note = ", ".join([words[1], summary.protocol, *sorted(clips), *failures(summary)])
-        link = run.key if len(runs) > 1 else ""
-        rows.append(Row(words[0], grid.cells(models[number]), note, strong=True, link=link))
-        published = quoted[number]
-        if published and published not in quoted[number + 1 : number + 2]:
-            row = published.row
-            note = f"{row.citation}, {row.label}: {' '.join(filter(None, (row.column, row.row)))}"
-            note += ", other components" * (not published.same_parts)
-            rows.append(Row("published", grid.cells(figures[number]), note, muted=True))
-    caption = CAPTION
-    if any(quoted):
-        caption += (
-            " In grey, published figures of the same or the nearest setting, measured on other "
-            "data: they show how hard a task is, not who is better."
-        )
-    return Table("", grid.columns(), rows, "Environment", caption, name="main")
+    Raises:
+        DataError: the folder holds no experiment, or one without any result.
+    """
+    experiment = Experiment.read(folder)
+    runs = [run for cell in experiment.cells for run in cell.runs]
+    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
+    if not found and not any(plan.progress() for plan in experiment.plans):
+        raise DataError(f"no run of {folder} is evaluated yet")
+    return [*found]
 
 
 def experiment_tables(
