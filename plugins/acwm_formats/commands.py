@@ -115,11 +115,15 @@ class FormatGroup(click.Group):
         self._method, self._base = method, base
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The names of the formats."""
-        return [component.name for component in _formats()]
+        """The names of the formats that can be read, or written, as far as it is known."""
+        return [each.name for each in _formats() if each.needs or self._can(each.load())]
+
+    def _can(self, target: Any) -> bool:
+        """Whether a format has the method of this command."""
+        return getattr(target, f"{self._method}s")()
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the formats without importing them."""
+        """List all formats without importing them; their summaries say which are only read."""
         with formatter.section("Formats"):
             formatter.write_dl([(each.name, each.summary) for each in _formats()])
 
@@ -148,7 +152,7 @@ class FormatGroup(click.Group):
 
         component = _formats()[cmd_name]
         target = component.load()
-        if not getattr(target, f"{self._method}s")():
+        if not self._can(target):
             done = {"read": "imported", "write": "exported"}
             other = done["write" if self._method == "read" else "read"]
             raise DataError(f"{cmd_name} can only be {other}, not {done[self._method]}")

@@ -30,7 +30,7 @@ REMOVED = {"--skip-damaged": "a damaged shard stops with its name; make it again
 @click.option(
     "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
 )
-@click.option("--skip-damaged", is_flag=True, hidden=True)
+@click.option("--skip-damaged", is_flag=True, hidden=True, help="Is gone.")
 def encode(
     data: Path,
     overrides: tuple[str, ...],
