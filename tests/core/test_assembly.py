@@ -79,3 +79,23 @@ def test_forcing_a_model_that_is_not_causal_is_refused(words):
 def test_an_unknown_objective_is_refused():
     with pytest.raises(RecipeError, match="did you mean 'diffusion_forcing'"):
         compose("push_cube_small", ["objective=difusion_forcing"])
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("+recurrent", "objective=next_frame"), r"a Denoiser\), which RecurrentModel is not"),
+        (
+            ("objective=regression",),
+            r"a Predictor\), which DiT is not: .*diffusion_forcing",
+        ),
+        (
+            ("objective=next_frame", "model=bidirectional"),
+            "further inputs previous, previous_sigma",
+        ),
+        (("objective=diffusion_forcing", "model.causal=false"), "is causal in time, but DiT"),
+    ],
+)
+def test_a_model_that_the_objective_cannot_train_is_one_sentence(words, sentence):
+    with pytest.raises(RecipeError, match=sentence):
+        build(*words)
