@@ -29,8 +29,6 @@ DEAREST = (
     "tests/tasks/",
     "tests/trust/",
     "tests/zoo/",
-    "tests/repository/test_site.py",
-    "tests/examples/",
     "tests/policies/",
 )
 """Where tests take long; these come first, so that processes side by side end at about one time."""
