@@ -82,10 +82,6 @@ class OtherDatasetError(DataError):
         )
 
 
-class DamagedShardError(DataError):
-    """The bytes of a shard are damaged; the message names the file."""
-
-
 class TrainingError(AcwmError):
     """Training cannot start or go on: NaN loss, a run folder in use, nothing to resume."""
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
+import multiprocessing
 import warnings
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 from acwm_core.checks.result import NotTried, expect, expect_equal, expect_is_a
 from acwm_core.checks.task import TaskChecks
 from acwm_core.checks.trial import BEGINNING
-from acwm_core.data.simulate import digests_elsewhere, simulate
+from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment, EnvironmentCard, Policy
 from acwm_core.env.episode import Episode, EpisodeSpec, Factor
 
@@ -274,3 +277,15 @@ def _expect_same(episode: Episode, found: dict[str, str], when: str) -> None:
     expect(expected.keys() == found.keys(), f"the state fields differ {when}")
     for name, digest in expected.items():
         expect(found[name] == digest, f"the same spec gives other {name} {when}")
+
+
+def digests_elsewhere(
+    make: Callable[[], Environment], spec: EpisodeSpec, frames: int
+) -> dict[str, str]:
+    """Hashes of the first `frames` frames of an episode, from a new process without torch."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_digests, make, spec, frames).result()
+
+
+def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
+    return simulate(make(), spec, frames=frames).digests()

@@ -1,34 +1,34 @@
 """Generate a dataset: many episodes, by many workers, resumable, with the same bytes every time.
 
-`fill` makes the shards of any dataset, simulated or recorded. A folder has one writer at a time.
+`fill` makes the shards of any dataset, simulated or recorded. A folder has one writer at a time. A
+shard is a pure function of its `ShardTask`: it does not matter which worker makes it, when, or what
+else runs.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
-from acwm_core.data.shards import shard_name
-from acwm_core.data.simulate import (
-    EpisodeSource,
-    ShardTask,
-    make_environment,
-    make_shard,
-    simulated,
-)
+from acwm_core.data.shards import ShardRecord, open_shard, shard_name, write_shard
+from acwm_core.data.simulate import make_environment, simulated
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split, draw_factors
+from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, FactorSetting, Split, draw_factors
 from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
-from acwm_core.executors import Executor, LocalExecutor, progress_bar
+from acwm_core.executors import Executor, LocalExecutor, Report, progress_bar
 from acwm_core.files import LOCK, held, remove_partial, writing
 from acwm_core.plugins import catalog
+
+EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
+"""Yields the episodes of given specs, one after another; importable and picklable."""
 
 SHARD_EPISODES = 32
 """Episodes per shard: a few MB at 64×64, a few tens at 240×240."""
@@ -139,6 +139,56 @@ def parse_episodes(text: str | None, card: EnvironmentCard, split: str = "all") 
         tests = [round(numbers[0] * card.episodes.get(s, 0) / full) if full else 1 for s in SPLITS]
         numbers += [max(1, number) for number in tests[1:]]
     return dict(zip(splits, numbers, strict=True))
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard to make."""
+
+    source: EpisodeSource
+    card: DatasetCard  # of the dataset
+    path: Path  # the tar file
+    split: Split  # its split
+    first: int  # index of its first episode in the split
+    episodes: int  # number of its episodes
+
+
+def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
+    """Write the shard of `task`; reports every episode.
+
+    If a killed command completed the shard but did not record it, it is only described again.
+
+    Returns:
+        The split, and the record of the shard for its manifest.
+
+    Raises:
+        DataError: an episode could not be made, or the shard could not be written.
+    """
+    numbers = range(task.first, task.first + task.episodes)
+    specs = [task.card.spec(task.split, number) for number in numbers]
+
+    def counted() -> Iterator[Episode]:
+        for episode in task.source(specs):
+            yield episode
+            report(1)
+
+    record = _existing_shard(task.path, specs)
+    if record is not None:
+        report(record.episodes)
+        return task.split, record
+    with writing(task.path):
+        fps, versions = task.card.environment.fps, task.card.versions
+        return task.split, write_shard(task.path, counted(), fps, versions)
+
+
+def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
+    """The record of the shard at `path` if it is complete and holds the episodes of `specs`."""
+    with contextlib.suppress(DataError):
+        reader = open_shard(path)
+        made = [reader.about(position)["spec"] for position in range(len(reader))]
+        if made == json.loads(json.dumps([spec.to_dict() for spec in specs])):
+            return ShardRecord.of_file(path, specs[0].index)
+    return None
 
 
 def fill(

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.video import decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.env.episode import Episode, EpisodeSpec
-from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.errors import DataError
 from acwm_core.files import parse_json, typed, written_whole
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
@@ -308,9 +308,9 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
     return ShardReader(path, tuple(episodes.values()), tuple(names))
 
 
-def damaged_shard(path: Path, reason: str) -> DamagedShardError:
+def damaged_shard(path: Path, reason: str) -> DataError:
     """The error for a shard that cannot be read."""
-    return DamagedShardError(
+    return DataError(
         f"shard {path} is damaged ({reason}): delete it and run the command that made it again"
     )
 

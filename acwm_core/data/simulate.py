@@ -1,41 +1,25 @@
-"""From an `EpisodeSpec` to an `Episode`, and from a `ShardTask` to a shard of episodes.
-
-A shard is a pure function of its task: it does not matter which worker makes it, when, or what
-else runs.
-"""
+"""From an `EpisodeSpec` to an `Episode`: an environment's frames, states and actions."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.card import DatasetCard
-from acwm_core.data.shards import ShardRecord, open_shard, write_shard
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
-from acwm_core.env.episode import Episode, EpisodeSpec, Split
+from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import (
     ActionError,
-    DataError,
     PluginError,
     ShapeError,
     expect,
     noting,
 )
-from acwm_core.executors import Report
-from acwm_core.files import writing
 from acwm_core.plugins import Component, catalog
-
-EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
 
 
 def make_environment(
@@ -142,57 +126,6 @@ def _stacked(what: str, values: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return np.stack(values)
 
 
-@dataclass(frozen=True)
-class ShardTask:
-    """One shard to make."""
-
-    # yields the episodes of given specs, one after another; importable and picklable
-    source: EpisodeSource
-    card: DatasetCard  # of the dataset
-    path: Path  # the tar file
-    split: Split  # its split
-    first: int  # index of its first episode in the split
-    episodes: int  # number of its episodes
-
-
-def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
-    """Write the shard of `task`; reports every episode.
-
-    If a killed command completed the shard but did not record it, it is only described again.
-
-    Returns:
-        The split, and the record of the shard for its manifest.
-
-    Raises:
-        DataError: an episode could not be made, or the shard could not be written.
-    """
-    numbers = range(task.first, task.first + task.episodes)
-    specs = [task.card.spec(task.split, number) for number in numbers]
-
-    def counted() -> Iterator[Episode]:
-        for episode in task.source(specs):
-            yield episode
-            report(1)
-
-    record = _existing_shard(task.path, specs)
-    if record is not None:
-        report(record.episodes)
-        return task.split, record
-    with writing(task.path):
-        fps, versions = task.card.environment.fps, task.card.versions
-        return task.split, write_shard(task.path, counted(), fps, versions)
-
-
-def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | None:
-    """The record of the shard at `path` if it is complete and holds the episodes of `specs`."""
-    with contextlib.suppress(DataError):
-        reader = open_shard(path)
-        made = [reader.about(position)["spec"] for position in range(len(reader))]
-        if made == json.loads(json.dumps([spec.to_dict() for spec in specs])):
-            return ShardRecord.of_file(path, specs[0].index)
-    return None
-
-
 def simulated(
     component: Component, specs: Sequence[EpisodeSpec], exploration: float = 0.0
 ) -> Iterator[Episode]:
@@ -227,15 +160,3 @@ def _environment(component: Component, options: Mapping[str, Any]) -> Environmen
 
 
 _environments: dict[str, Environment] = {}
-
-
-def digests_elsewhere(
-    make: Callable[[], Environment], spec: EpisodeSpec, frames: int
-) -> dict[str, str]:
-    """Hashes of the first `frames` frames of an episode, from a new process without torch."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_digests, make, spec, frames).result()
-
-
-def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
-    return simulate(make(), spec, frames=frames).digests()

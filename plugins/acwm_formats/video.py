@@ -21,7 +21,6 @@ from acwm_core.data.video import MP4
 from acwm_core.env.environment import resolve_size
 from acwm_core.errors import DataError
 
-MAX_PIXELS = 2**25  # most pixels of a frame: a little more than 8K video
 MIN_SIDE = 16
 MAX_BYTES = 2**32  # largest size of one episode's frames
 
@@ -37,7 +36,7 @@ def video_facts(path: Path) -> VideoFacts:
     """Read the properties of the MP4 file `path`.
 
     Raises:
-        DataError: it is missing, not an MP4 video, or has frames of an absurd size.
+        DataError: it is missing, or not an MP4 video.
     """
     with _opened(path) as (_, stream):
         return VideoFacts((stream.height, stream.width), float(stream.average_rate or 0))
@@ -84,8 +83,6 @@ def _opened(path: Path) -> Generator[tuple[Any, Any]]:
             if not container.streams.video:
                 raise DataError(f"{path} holds no video")
             stream = container.streams.video[0]
-            if not 0 < stream.height * stream.width <= MAX_PIXELS:
-                raise DataError(f"{path} claims frames of {stream.height}×{stream.width}")
             stream.codec_context.thread_count = 1
             yield container, stream
     except FFmpegError as error:

@@ -8,11 +8,10 @@ import pytest
 
 from acwm_core.checks import check_environment
 from acwm_core.checks.disc import Disc
-from acwm_core.checks.environment import EnvironmentChecks
+from acwm_core.checks.environment import EnvironmentChecks, digests_elsewhere
 from acwm_core.checks.result import checks_of, run_checks
 from acwm_core.checks.task import TaskChecks
 from acwm_core.data.shards import open_shard, write_shard
-from acwm_core.data.simulate import digests_elsewhere
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.errors import UnknownNameError

@@ -11,7 +11,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.latents import LatentClipDataset, encode_windows
 from acwm_core.data.loader import ClipLoader, ClipSampler
 from acwm_core.data.shards import open_shard
-from acwm_core.errors import DamagedShardError, DataError
+from acwm_core.errors import DataError
 
 FRAMES = 9
 NAME = "shard-00001.tar"
@@ -67,7 +67,7 @@ def encode(data):
 
 def test_encoding_names_it_and_goes_on_when_it_is_mended(data, square_data):
     flip(data)
-    with pytest.raises(DamagedShardError, match=SENTENCE):
+    with pytest.raises(DataError, match=SENTENCE):
         encode(data)
     shutil.copy(square_data / "train" / NAME, data / "train" / NAME)
     encode(data)
@@ -80,5 +80,5 @@ def test_latents_without_their_actions_are_no_clips(data):
     """They were encoded while the shard was whole."""
     encode(data)
     cut(data)
-    with pytest.raises(DamagedShardError, match=SENTENCE):
+    with pytest.raises(DataError, match=SENTENCE):
         LatentClipDataset(EpisodeDataset(data, "train"), Blocks().fingerprint(), frames=FRAMES)

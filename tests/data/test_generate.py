@@ -17,9 +17,9 @@ from square_world import Square
 from acwm_core.cli.main import main
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
-from acwm_core.data.generate import generate, parse_episodes
+from acwm_core.data.generate import ShardTask, generate, make_shard, parse_episodes
 from acwm_core.data.shards import open_shard
-from acwm_core.data.simulate import ShardTask, make_shard, simulated
+from acwm_core.data.simulate import simulated
 from acwm_core.errors import DataError, RecipeError, UnknownNameError
 from acwm_core.executors import LocalExecutor, progress_bar
 from acwm_core.files import alone, held
