@@ -44,7 +44,7 @@ def test_pickled_code_is_not_run(folder, tmp_path, zipped):
 def test_what_is_no_metadata_is_refused(folder, content):
     (folder / "ind_train" / "metadata.pt").write_bytes(content)
     with pytest.raises(DataError, match=r"metadata\.pt"):
-        Published(folder).read()
+        Published().read(folder)
 
 
 def test_cut_metadata_is_refused(folder):
@@ -72,7 +72,7 @@ def test_cut_metadata_is_refused(folder):
 def test_entries_that_cannot_be_are_refused(folder, change, problem):
     release.rewrite(folder / "ind_test", lambda entries: entries[1].update(change))
     with pytest.raises(DataError, match=problem):
-        Published(folder).read()
+        Published().read(folder)
 
 
 def test_videos_that_cannot_be_are_refused(folder, tmp_path):
