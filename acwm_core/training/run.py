@@ -21,7 +21,6 @@ from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
-from acwm_core.training.checkpoints import read_details
 from acwm_core.training.trained import find_run, trained_models
 
 FORMAT = 1
@@ -185,6 +184,8 @@ def training_of(run: RunFolder) -> dict[str, Any]:
 
     It is empty for a folder without checkpoints; the weights of a trained model hold it instead.
     """
+    from acwm_core.training.checkpoints import read_details  # imports torch.distributed
+
     if not run.last_checkpoint.exists():
         return {}
     return read_details(run.last_checkpoint).get("callbacks", {}).get("CpuTime", {})
