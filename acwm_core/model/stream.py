@@ -37,10 +37,6 @@ class Stream:
     Attributes:
         given: the codec's reconstruction of the given frames, `[B, K, 3, H, W]`.
         first: the reconstruction of the first frame, `[B, 3, H, W]`.
-
-    Raises:
-        ShapeError: the frames have another shape, or the number of actions is not K − 1.
-        RecipeError: the components cannot be streamed; says which, and what to train instead.
     """
 
     def __init__(
@@ -107,9 +103,6 @@ class Stream:
 
         Yields:
             The T frames, up to `together` · `temporal_stride` at a time.
-
-        Raises:
-            ShapeError, ActionError: as for `step`.
         """
         stride = self._world.codec.temporal_stride
         if actions.ndim != 3:

@@ -129,10 +129,6 @@ class WorldModel(nn.Module):
 
         `check` refuses frames and actions that no model was trained on. Without it they are used as
         they are, e.g. recorded actions that are out of bounds.
-
-        Raises:
-            ShapeError: the frames are not float in [0, 1]; or as for `rollout_chunks`.
-            ActionError: actions are not finite, or out of bounds.
         """
         if check:
             check_pixels(given)
@@ -293,11 +289,7 @@ class WorldModel(nn.Module):
         return actions
 
     def normalise(self, actions: Actions) -> Actions:
-        """Scale raw actions `[B, T, A]` to [-1, 1] by their bounds.
-
-        Raises:
-            ActionError: wrong action size.
-        """
+        """Scale raw actions `[B, T, A]` to [-1, 1] by their bounds."""
         if actions.shape[2] != len(self.action_low):
             raise ActionError(
                 f"the model was built for {len(self.action_low)} action dimensions, "
