@@ -1,5 +1,7 @@
 """Agreement of scores against SciPy, against examples worked out by hand, and against chance."""
 
+import functools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -53,21 +55,22 @@ def test_what_is_constant_has_no_correlation():
 
 
 def test_intervals_cover_policies_and_episodes():
+    intervals = functools.partial(agreement, resamples=200)
     skill = np.linspace(0, 1, 12)[:, None]
     judge, truth = (skill + 0.3 * RNG.normal(size=(12, 10)) for _ in range(2))
-    few, many = (agreement(judge[:, :n], truth[:, :n]).spearman for n in (5, 10))
+    few, many = (intervals(judge[:, :n], truth[:, :n]).spearman for n in (5, 10))
     assert few.low < few.value < few.high <= 1
     assert many.low > few.low
     # with fewer episodes they are of policies alone, and so of any number of the same ones
-    one = agreement(judge[:, :1], truth[:, :1]).spearman
+    one = intervals(judge[:, :1], truth[:, :1]).spearman
     assert one.low < one.value < one.high
-    assert one == agreement(*(np.repeat(each[:, :1], 3, 1) for each in (judge, truth))).spearman
-    same = agreement(truth, truth)
+    assert one == intervals(*(np.repeat(each[:, :1], 3, 1) for each in (judge, truth))).spearman
+    same = intervals(truth, truth)
     for each in (same.pearson, same.spearman, same.kendall):
         assert (each.value, each.low, each.high) == pytest.approx((1, 1, 1))
     for each in (same.mmrv, same.optimism):
         assert (each.value, each.low, each.high) == (0, 0, 0)
-    off = agreement(truth + 0.25, truth)
+    off = intervals(truth + 0.25, truth)
     assert (off.optimism.low, off.optimism.high) == pytest.approx((0.25, 0.25))
 
 
