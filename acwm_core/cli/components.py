@@ -93,7 +93,7 @@ def show(recipe: str, overrides: tuple[str, ...]) -> None:
     """
     from acwm_core.recipe import compose
 
-    click.echo(compose(recipe, overrides).to_yaml(), nl=False)
+    click.echo(compose(recipe, overrides, trusted=True).to_yaml(), nl=False)
 
 
 @click.command()

@@ -16,10 +16,7 @@ from acwm_core.training.threads import wait_without_spinning
 @click.option(
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
-@click.option(
-    "--trust-recipe", is_flag=True, help="Execute code that the recipe of a run folder names."
-)
-def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe: bool) -> None:
+def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     """Train the world model of RECIPE.
 
     RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it:
@@ -36,13 +33,11 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None, trust_recipe:
     The run folder contains the full recipe, checkpoints, logs (tensorboard --logdir runs) and, at
     the end, model.safetensors.
     """
-    from acwm_core.recipe.recipe import compose, refuse_code
+    from acwm_core.recipe import compose
 
     resumed = [each for each in overrides if each.startswith("resume=")]
     others = [each for each in overrides if each not in resumed]
     composed = compose(recipe, others)
-    if not trust_recipe:
-        refuse_code(Path(recipe))
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume not in (None, "auto"):
         resume = RUN.convert(resume, None, None)

@@ -23,6 +23,7 @@ from acwm_core.errors import AcwmError, AcwmWarning, is_for_users, noting, sente
 from acwm_core.files import disk_error
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.plugins import catalog
+from acwm_core.recipe.trust import trust_recipes
 from acwm_core.renamed import RenamedWarning
 
 
@@ -76,7 +77,8 @@ class AcwmGroup(click.Group):
         _print_anything()
         words = list(sys.argv[1:] if args is None else args)
         shown = "--traceback" in words
-        words = [word for word in words if word != "--traceback"]  # at any position
+        trust_recipes("--trust-recipe" in words)
+        words = [word for word in words if word not in ("--traceback", "--trust-recipe")]
         try:
             with _named_if_of_others(words):
                 result = super().main(words, *more, **{**extra, "standalone_mode": False})
@@ -163,6 +165,12 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 @click.version_option(__version__, prog_name="acwm")
 @click.option(
     "--traceback", is_flag=True, expose_value=False, help="Show the full traceback of errors."
+)
+@click.option(
+    "--trust-recipe",
+    is_flag=True,
+    expose_value=False,
+    help="Run code that a recipe names, e.g. a callback; what is typed is run anyway.",
 )
 def main() -> None:
     """Action-conditioned video world models: simulate, train, evaluate.

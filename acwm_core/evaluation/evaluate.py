@@ -144,7 +144,7 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
                 f"{override!r} is no setting of the evaluation; it takes overrides such as "
                 "evaluation.steps=10"
             )
-    recipe = compose(folder.recipe, overrides)
+    recipe = compose(folder.recipe, overrides, sections=["evaluation"])
     config = EvaluationConfig(**recipe.evaluation)
     if not config.metrics:
         raise RecipeError(

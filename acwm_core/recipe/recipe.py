@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.errors import RecipeError
 from acwm_core.recipe.check import validate
 from acwm_core.recipe.compose import COMPONENTS, read_recipe
 from acwm_core.recipe.text import dump
+from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
 
 FREE_TO_CHANGE = (
     "data.batch_size",
@@ -88,8 +88,8 @@ class Recipe:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Recipe:
-        """Read a recipe file, e.g. the one saved in a run."""
-        return compose(path)
+        """Read a recipe file, e.g. the one saved in a run; nothing that it names is imported."""
+        return compose(path, trusted=True)
 
     def to_dict(self) -> dict[str, Any]:
         """The sections of a recipe file, with values of plain JSON types."""
@@ -107,7 +107,13 @@ class Recipe:
         return dump(self.to_dict())
 
 
-def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+def compose(
+    recipe: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    sections: Sequence[str] | None = None,
+    trusted: bool | None = None,
+) -> Recipe:
     """Read a recipe, apply overrides to it and check everything.
 
     Names, sections and the values of `training`, `data` and `evaluation` are checked first, at
@@ -116,31 +122,18 @@ def compose(recipe: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     Args:
         recipe: a path, or the name of a packaged recipe such as ``push_cube_small``.
         overrides: ``conditioner=cross_attention``, ``model.layers=4``, ``trainer.devices=2`` …
+        sections: the sections that will be used; all by default. In others, code may be named.
+        trusted: whether code that the files name may be run; what `overrides` name always may. By
+            default only if the command line said ``--trust-recipe``.
 
     Raises:
-        RecipeError: a file, name, parameter or type is wrong; suggests the most similar one.
+        RecipeError: a file, name, parameter or type is wrong; suggests the most similar one. Or
+            the recipe names code that the overrides do not.
     """
-    return Recipe.from_dict(read_recipe(recipe, overrides))
-
-
-def refuse_code(recipe: Path) -> None:
-    """Refuse a recipe in a run folder, which may be untrusted, if it names code to be run.
-
-    Raises:
-        RecipeError: it names code; says where, and how to allow it.
-    """
-    if not (recipe.is_file() and (recipe.parent / "card.yaml").exists()):
-        return  # the user's own recipe
-    for flag, value in flat_items(read_recipe(recipe).get("trainer") or {}):
-        values = cast(list[object], value if isinstance(value, list) else [value])
-        paths = any(isinstance(each, str) and "." in each for each in values)
-        if flag != "default_root_dir" and (
-            paths or any(isinstance(v, dict | list) for v in values)
-        ):
-            raise RecipeError(
-                f"{recipe} is in a run folder, and its trainer.{flag} names code that would be "
-                "executed: check it, and add --trust-recipe if you trust its author"
-            )
+    composed = read_recipe(recipe, overrides)
+    if not (recipes_are_trusted() if trusted is None else trusted):
+        refuse_code(composed, overrides, sections, recipe)
+    return Recipe.from_dict(composed)
 
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:

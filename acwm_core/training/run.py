@@ -20,7 +20,8 @@ from acwm_core.files import check_inside, written_whole
 from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite
 from acwm_core.model.world_model import WorldModel
-from acwm_core.recipe import Recipe
+from acwm_core.recipe import Recipe, compose
+from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.training.trained import find_run, trained_models
 
 FORMAT = 1
@@ -93,7 +94,7 @@ def load_run(path: Path | str) -> RunBundle:
             "checkpoint"
         )
     check_inside(folder.path, *OWN)
-    recipe = Recipe.from_yaml(folder.recipe)
+    recipe = compose(folder.recipe, sections=COMPONENTS)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)
     load_weights(world_model, folder.weights)

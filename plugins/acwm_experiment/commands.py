@@ -17,7 +17,7 @@ from acwm_core.files import writable
 if TYPE_CHECKING:
     from acwm_experiment.plan import ExperimentPlan
 
-COMMAND = (sys.executable, "-m", "acwm_core.cli")
+COMMAND = (sys.executable, "-P", "-m", "acwm_core.cli")
 """The command that runs a step; the words of the step are appended."""
 
 _say = partial(click.echo, err=True)
@@ -74,6 +74,7 @@ def experiment(
     If it is interrupted, run the same command again to continue. A failed run does not stop the
     others; the exit code is then 1. --plan changes nothing and works at any time.
     """
+    from acwm_core.recipe.trust import recipes_are_trusted
     from acwm_experiment.files import read_experiment
     from acwm_experiment.grid import read_grid
     from acwm_experiment.plan import make_plan
@@ -97,17 +98,18 @@ def experiment(
         return
     for place in (folder, runs or folder / "runs"):
         writable(place, folder=True)
+    command = (*COMMAND, "--trust-recipe") if recipes_are_trusted() else COMMAND
     if executor:
-        count = submit_experiment(plan, COMMAND, executor, options, say=_say)
+        count = submit_experiment(plan, command, executor, options, say=_say)
         click.echo(f"{count} jobs submitted; --plan says how far they are")
     else:
-        _run(plan, jobs)
+        _run(plan, command, jobs)
 
 
-def _run(plan: ExperimentPlan, jobs: int) -> None:
+def _run(plan: ExperimentPlan, command: Sequence[str], jobs: int) -> None:
     from acwm_experiment.runner import run_experiment
 
-    steps, before, failures = run_experiment(plan, COMMAND, jobs=jobs, say=_say)
+    steps, before, failures = run_experiment(plan, command, jobs=jobs, say=_say)
     done = f", {before} of them in earlier runs" if before else ""
     click.echo(f"{steps - len(failures)} of {steps} steps are done{done}")
     for step, reason in failures.items():

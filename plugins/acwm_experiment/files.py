@@ -15,6 +15,7 @@ from acwm_core.cli.arguments import seed_numbers
 from acwm_core.env.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.compose import find_recipe, read_recipe
+from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
 from acwm_core.recipe.types import checked
 from acwm_experiment.table import Experiment, ExperimentCell
 
@@ -103,6 +104,8 @@ def read_experiment(
     """
     path = find_recipe(str(name), Path())
     content = read_recipe(path)
+    if not recipes_are_trusted():
+        refuse_code(content, origin=path)
     if "rows" not in content and "plans" not in content:
         raise RecipeError(
             f"{name} is not an experiment: it has no `rows` and no `plans` (docs/experiments.md)"
