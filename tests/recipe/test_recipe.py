@@ -79,7 +79,7 @@ def test_a_saved_recipe_reads_back_the_same(recipe: Path, tmp_path: Path) -> Non
     assert Recipe.from_yaml(saved) == composed
     assert Recipe.from_dict(composed.to_dict()) == composed
     # Standing on its own: a component renamed in it takes its own defaults, not the saved ones.
-    assert compose(saved, ["model=dit_s"]).model.params["width"] == 768
+    assert compose(saved, ["model=dit_s"], trusted=True).model.params["width"] == 768
 
 
 WRONG = {
