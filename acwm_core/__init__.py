@@ -19,9 +19,9 @@ def __getattr__(name: str) -> str:
 
 def main() -> None:
     """Entry point of the program `acwm`: handle Ctrl-C, then run the command line."""
-    from acwm_core.interrupts import handle_interrupts
+    from acwm_core.interrupts import begin_process
 
-    handle_interrupts()
+    begin_process()
     import importlib
 
     importlib.import_module("acwm_core.cli").main()  # by name, as the CLI imports this package

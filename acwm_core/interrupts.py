@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command at any moment, with one line and the exit code of shells."""
+"""How a command's process starts and ends: Ctrl-C at any moment, and no module from the folder."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ INTERRUPTED = 130
 
 SHOW_CURSOR = b"\x1b[?25h"
 """Terminal code that shows the cursor again, in case a progress bar has hidden it."""
+
+
+def begin_process() -> None:
+    """Prepare the process of a command, before anything heavy is imported."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child imports modules from the working folder
+    handle_interrupts()
 
 
 def handle_interrupts() -> None:

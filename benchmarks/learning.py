@@ -145,7 +145,7 @@ def acwm(*words: str) -> float:
     Raises:
         CalledProcessError: the command failed.
     """
-    command = [sys.executable, "-m", "acwm_core.cli", *words]
+    command = [sys.executable, "-P", "-m", "acwm_core.cli", *words]
     log = subprocess.DEVNULL
     process = subprocess.Popen(
         command, stdout=log, env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

@@ -59,7 +59,7 @@ def steps_per_second(run: Path, steps: int, environment: dict[str, str]) -> tupl
         words += [f"trainer.max_steps={WARM_UP + steps}", "trainer.log_every_n_steps=1"]
         words += [f"training.{each}_every_n_steps=1000000" for each in ("validate", "checkpoint")]
         process = subprocess.Popen(
-            [sys.executable, "-c", code, *words, "training.sample_every_n_steps=0"],
+            [sys.executable, "-P", "-c", code, *words, "training.sample_every_n_steps=0"],
             env={**kept, **environment},
         )
         reached: dict[int, float] = {}

@@ -55,7 +55,7 @@ async def listen(url: str, seconds: float) -> list[tuple[float, dict[str, Any]]]
 def played(model: str, seconds: float) -> list[tuple[float, dict[str, Any]]]:
     """Listen to a server of its own."""
     code = "from acwm_core.cli import main; main()"
-    command = [sys.executable, "-c", code, "play", model, "--no-browser"]
+    command = [sys.executable, "-P", "-c", code, "play", model, "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as server:
         assert server.stdout is not None
         try:

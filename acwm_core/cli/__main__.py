@@ -4,7 +4,7 @@ import os
 import threading
 
 from acwm_core.cli.main import main
-from acwm_core.interrupts import handle_interrupts
+from acwm_core.interrupts import begin_process
 
 ENDS_WITH_INPUT = "ACWM_ENDS_WITH_INPUT"
 """Environment variable that makes a command end once its standard input is closed."""
@@ -20,5 +20,5 @@ def end_with_input() -> None:
 if __name__ == "__main__":
     if ENDS_WITH_INPUT in os.environ:
         threading.Thread(target=end_with_input, daemon=True).start()
-    handle_interrupts()
+    begin_process()
     main(prog_name="acwm")

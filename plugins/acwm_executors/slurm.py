@@ -6,6 +6,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -144,7 +145,7 @@ class SlurmExecutor(BatchExecutor):
 
         submitit has parameters for some options only. Its own default time limit is left out.
         """
-        launcher = submitit.SlurmExecutor(self.folder)
+        launcher = submitit.SlurmExecutor(self.folder, python=f"{shlex.quote(sys.executable)} -P")
         options = (self.sbatch, self.steps.get(kind) if kind else None)
         lines = [*(f"#SBATCH {each}" for each in options if each), *setup]
         launcher.update_parameters(

@@ -144,6 +144,27 @@ def test_steps_of_an_experiment_import_nothing_from_the_working_folder(tmp_path)
     assert not (tmp_path / "mark").exists()
 
 
+def test_no_child_imports_from_the_working_folder(tmp_path):
+    """Workers too: Python starts them by a command that would look there first."""
+    script, folder = tmp_path / "script/run.py", tmp_path / "folder"
+    for place in (script.parent, folder):
+        place.mkdir()
+    (folder / "multiprocessing.py").write_text("open('mark', 'w').close()\n")
+    script.write_text(
+        "import contextlib, multiprocessing, sys, acwm_core\n"
+        "if __name__ == '__main__':\n"
+        "    if 'safe' in sys.argv:\n"
+        "        sys.argv = ['acwm', '--version']\n"
+        "        with contextlib.suppress(SystemExit):\n"
+        "            acwm_core.main()\n"
+        "    worker = multiprocessing.get_context('spawn').Process(target=print)\n"
+        "    worker.start(), worker.join()\n"
+    )
+    for how in ("safe", "unsafe"):
+        subprocess.run([sys.executable, script, how], cwd=folder, capture_output=True)
+        assert (folder / "mark").exists() == (how == "unsafe")
+
+
 def test_usual_flags_are_no_code(tmp_path):
     flags = {"max_steps": 3, "devices": [0], "strategy": "ddp", "max_time": "00:00:01:00"}
     metrics = ["psnr", "torchmetrics.image.SpectralAngleMapper"]  # of a library that is installed
