@@ -54,7 +54,7 @@ def evaluate(
     if protocol:
         overrides = (*overrides, f"evaluation.protocol={protocol}")
     if overrides:  # report misspelt ones before torch is imported
-        compose(run / "recipe.yaml", overrides)
+        compose(run / "recipe.yaml", overrides, sections=["evaluation"])
 
     if sweeps:
         from acwm_severity.sweep import sweep_severity
