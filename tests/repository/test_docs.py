@@ -3,6 +3,7 @@
 import ast
 import importlib
 import itertools
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -21,6 +22,7 @@ DOCUMENTS = [
     *ROOT.glob("docs/*.md"),
     *ROOT.glob("examples/*/README.md"),
 ]
+REFERENCE = sorted(ROOT.glob("docs/reference/*.md"))
 
 
 def names(values):
@@ -124,6 +126,12 @@ def test_python_blocks_import_what_exists(document):
             elif isinstance(node, ast.Import):
                 for alias in node.names:
                     importlib.import_module(alias.name)
+
+
+@pytest.mark.parametrize("page", REFERENCE, ids=names(REFERENCE))
+def test_what_the_reference_shows_exists(page):
+    for name in re.findall(r"^::: (\S+)", page.read_text(), re.M):
+        pkgutil.resolve_name(name)
 
 
 def test_the_recipe_in_the_documents_is_valid(tmp_path):
