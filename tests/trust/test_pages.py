@@ -77,7 +77,7 @@ def test_a_video_that_is_a_link(folder, tmp_path):
     (folder / "evaluation" / "videos").mkdir()
     (folder / "evaluation" / "videos" / "a.mp4").symlink_to(tmp_path / "secret")
     edit(folder, lambda values: values["videos"].append(video("a.mp4")))
-    assert "is a link that leads out of" in refused(folder)
+    assert "leads out of" in refused(folder)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,14 @@ def test_names_become_no_markup_and_no_path(folder, name, place):
             values["videos"].append({**video("a.mp4"), "split": name})
 
     edit(folder, change)
-    refused(folder)
+    if place != "row":
+        refused(folder)
+        return
+    page = folder.parent / "page.html"  # rows that acwm does not know are not shown
+    result = CliRunner().invoke(main, ["report", str(folder), "--out", str(page)])
+    assert result.exit_code == 0, result.output
+    own_script_only(page)
+    assert EVIL not in page.read_text()
 
 
 class Scripts(HTMLParser):
@@ -203,19 +210,6 @@ def test_names_are_no_formulas_in_charts(tmp_path):
     chart.save(tmp_path / "chart.pdf")
 
 
-def test_control_characters_reach_no_terminal(folder):
-    escape = "\x1b]0;pwned\x07"
-    edit(folder, lambda values: values.update(run=escape))
-    assert escape not in refused(folder)
-    strange = folder.parent / f"\x1b[31m{folder.name}"
-    result = CliRunner().invoke(main, ["report", str(strange)], color=True)  # as on a terminal
-    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "\x1b" not in result.output + result.stderr
-    shutil.copytree(folder, strange)
-    result = CliRunner().invoke(main, ["leaderboard", str(folder.parent)], color=True)
-    assert "\x1b" not in result.output + result.stderr
-
-
 DAMAGES = {
     "no JSON": lambda file: file.write_text("{"),
     "a list": lambda file: file.write_text("[]"),
@@ -228,10 +222,8 @@ DAMAGES = {
         file, lambda v: v["splits"]["ind_test"]["scores"].update(paired={})
     ),
     "no parts": lambda file: rewrite(file, lambda v: v.update(parts={})),
-    "short bounds": lambda file: rewrite(file, lambda v: v["environment"]["action"].update(low=[])),
     "fps of 0": lambda file: rewrite(file, lambda v: v["environment"].update(fps=0)),
     "another headline": lambda file: rewrite(file, lambda v: v.update(headline="mse_")),
-    "huge": lambda file: rewrite(file, lambda v: v["provenance"].update(parameters=10**400)),
     "no rows": lambda file: (file.parent / "episodes.parquet").write_bytes(b"PAR1"),
     "gone": lambda file: file.unlink(),
 }
