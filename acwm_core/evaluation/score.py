@@ -31,11 +31,6 @@ def build_metrics(
     Args:
         of_branches: whether they must be metrics that compare branches, or must not.
         only: names of those to build, in this order; all by default.
-
-    Raises:
-        RecipeError: a metric compares branches but must not, or the reverse; a name is used twice.
-        UnknownNameError, MissingExtraError: a metric is not available.
-        PluginError: what is registered under a name is no `Metric`.
     """
     configs = metric_configs(metrics, options)
     chosen = configs if only is None else [name for name in only if name in configs]
@@ -169,10 +164,6 @@ def estimator_for(card: EnvironmentCard) -> StateEstimator | None:
 
     Also None if it cannot read data with this card, such as recordings of the same task from
     elsewhere that have no masks.
-
-    Raises:
-        PluginError: what is registered is no `StateEstimator`.
-        MissingExtraError, DataError: it is not available, or its weights cannot be read.
     """
     if card.name not in catalog().registry("estimator"):
         return None

@@ -83,11 +83,7 @@ class Comparison:
     uses: list[Use] = field(default_factory=list[Use])
 
     def write(self, path: Path) -> None:
-        """Write the comparison as JSON.
-
-        Raises:
-            DataError: the file cannot be written there.
-        """
+        """Write the comparison as JSON."""
         from pydantic import TypeAdapter
 
         writable(path).parent.mkdir(parents=True, exist_ok=True)

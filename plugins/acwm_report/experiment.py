@@ -44,9 +44,6 @@ def experiment_tables(
 
     Args:
         links: ids on the page that the row titles link to, by run folder.
-
-    Raises:
-        DataError: no run of it is evaluated, or a result cannot be read.
     """
     if experiment is None:
         return []

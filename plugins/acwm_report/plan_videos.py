@@ -153,9 +153,6 @@ class VideoRoom:
             folder: the results of a task, in `root`.
             task: name of the task.
             key: prefix of the videos' ids on the page.
-
-        Raises:
-            DataError: a video's file is damaged.
         """
         chosen: list[PlanVideo] = []
         pattern = f"{folder.relative_to(root)}/{VIDEOS}/model-*.json"
@@ -168,11 +165,7 @@ class VideoRoom:
 
 
 def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[PlanVideo]]:
-    """Videos of plans with the model, per run.
-
-    Raises:
-        DataError: a video's file is damaged.
-    """
+    """Videos of plans with the model, per run."""
     return [
         [
             video

@@ -61,11 +61,7 @@ class PlanTable:
 
 
 def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
-    """The plan tables made with these weights, by folder, in order of their tasks.
-
-    Raises:
-        DataError: a table is damaged.
-    """
+    """The plan tables made with these weights, by folder, in order of their tasks."""
     files = result_files(run, f"{PLANS}/*/{SUMMARY}")
     found = {path.parent: read_json(path, PlanTable, "a table of plans") for path in files}
     return {path: each for path, each in found.items() if each.file_sha256 == weights}

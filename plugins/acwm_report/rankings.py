@@ -18,16 +18,12 @@ JUDGES = {
 
 
 def rankings(run: EvaluatedRun) -> list[Ranking]:
-    """The rankings made with the evaluated weights, in order of their tasks.
-
-    Raises:
-        DataError: a ranking file is damaged.
-    """
+    """The rankings made with the evaluated weights, in order of their tasks."""
     return rankings_of(run.folder, run.summary.provenance["weights_sha256"])
 
 
 def rankings_of(run: Path, weights: str) -> list[Ranking]:
-    """The rankings in a run folder made with weights of this SHA-256; raises like `rankings`."""
+    """The rankings in a run folder made with weights of this SHA-256."""
     files = result_files(run, f"{FOLDER}/*/{FILE}")
     found = [read_json(path, Ranking, "a ranking of policies") for path in files]
     return [each for each in found if each.weights == weights]

@@ -19,10 +19,6 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     """The commands for the data, the run, its evaluation, its severity curves and its report.
 
     Evaluation settings that the run's own recipe already contains are not repeated.
-
-    Raises:
-        RecipeError: the recipe in the run folder is damaged.
-        DataError: a severity curve is damaged.
     """
     facts, data = summary.provenance, summary.provenance["dataset"]
     original = folder / "recipe.yaml"

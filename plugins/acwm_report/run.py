@@ -134,11 +134,7 @@ def result_files(run: Path, pattern: str) -> list[Path]:
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:
-    """Read evaluated runs.
-
-    Raises:
-        DataError: no run is given, or one was not evaluated.
-    """
+    """Read evaluated runs."""
     if not folders:
         raise DataError("a report needs at least one run: name its folder")
     return [EvaluatedRun.read(Path(run), f"run{n}") for n, run in enumerate(folders, start=1)]

@@ -62,11 +62,7 @@ KINDS = {"ranking": "ranking policies", "planning": "planning"}
 
 
 def uses_of(label: str, run: Path, summary: Summary) -> list[Use]:
-    """The rankings and plans in a run folder that were made with the evaluated weights.
-
-    Raises:
-        DataError: a file is damaged.
-    """
+    """The rankings and plans in a run folder that were made with the evaluated weights."""
     weights = summary.provenance["weights_sha256"]
     ranked = [each for found in rankings_of(run, weights) for each in _ranked(label, found)]
     tables = plan_tables_of(run, weights).values()

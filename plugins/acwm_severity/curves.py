@@ -102,11 +102,7 @@ class SeverityCurve:
 
 
 def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
-    """The curves of a run, sorted by factor name; with `weights`, only those of this hash.
-
-    Raises:
-        DataError: a file is from another version of acwm.
-    """
+    """The curves of a run, sorted by factor name; with `weights`, only those of this hash."""
     curves: list[SeverityCurve] = []
     for path in sorted((run / FOLDER / SEVERITY).glob("*.json")):
         try:
