@@ -19,6 +19,9 @@ from acwm_core.recipe.compose import parse_override, with_overrides
 NAMES_OF_CODE = ("class_path", "metric_class", "function", "detector")
 """Parameters whose value is imported, or is a file that is a program."""
 
+FOLDER = "default_root_dir"
+"""The flag of the trainer that names a folder, which training writes to."""
+
 _IMPORTED = re.compile(r"[A-Za-z_]\w*(\.\w+)*:[A-Za-z_]\w*(\.\w+)*")
 _OVERRIDE = re.compile(r"[\w.]+=")
 
@@ -59,16 +62,18 @@ def refuse_code(
     used = {name: recipe[name] for name in recipe if sections is None or name in {*sections}}
     for place, value in _code(used):
         if place not in known or known[place] != value:
+            is_folder = place.endswith(FOLDER)
+            what = "a folder to write to" if is_folder else "code that would be executed"
             raise RecipeError(
-                f"{place}={value!s:.80} in {origin} names code that would be executed: check it, "
-                "and add --trust-recipe if you trust its author"
+                f"{place}={value!s:.80} in {origin} names {what}: check it, and add "
+                "--trust-recipe if you trust its author"
             )
 
 
 def _code(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """The values that name code, by their place, e.g. ``evaluation.metrics[0].metric_class``."""
     name = place.rpartition(".")[2].partition("[")[0]
-    in_trainer = place.startswith("trainer.") and name != "default_root_dir"
+    in_trainer = place.startswith("trainer.")
     if isinstance(values, Mapping):
         if in_trainer:  # the class and arguments of an object
             yield place, values
@@ -80,7 +85,11 @@ def _code(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     elif isinstance(values, str):
         if _OVERRIDE.match(values):  # in an experiment's file
             yield from _code(parse_override(values))
-        elif name in NAMES_OF_CODE or _IMPORTED.fullmatch(values) or (in_trainer and "." in values):
+        elif (
+            name in (*NAMES_OF_CODE, FOLDER)
+            or _IMPORTED.fullmatch(values)
+            or (in_trainer and "." in values)
+        ):
             yield place, values
 
 

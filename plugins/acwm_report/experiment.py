@@ -13,6 +13,7 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.statistics import ClipScores
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import tabulate
+from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
 from acwm_experiment.table import SUMMARY, Experiment
 from acwm_report.run import described
 from acwm_report.scores import CAPTION, ScoreGrid, published_scores
@@ -76,6 +77,8 @@ class _ExperimentTables:
         from acwm_core.evaluation.score import build_metrics  # needs torch
 
         settings = first.provenance.get("evaluation", {})
+        if not recipes_are_trusted():
+            refuse_code({"evaluation": settings}, origin=f"the results of {first.run}")
         listed = settings.get("metrics", infos), settings.get("metric_options")
         self._metrics = build_metrics(*listed, only=[name for name in names if name in infos])
         self._clips = {place: self._read(runs) for place, runs in self._runs.items()}

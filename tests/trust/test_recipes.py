@@ -52,6 +52,14 @@ def extended(path, base, **sections):
     return path
 
 
+def test_a_recipe_chooses_no_folder_to_write_to(tmp_path):
+    flags = {"default_root_dir": str(tmp_path / "elsewhere")}
+    recipe = extended(tmp_path / "mine.yaml", RUN / "recipe.yaml", trainer=flags)
+    with pytest.raises(RecipeError, match="names a folder to write to"):
+        compose(recipe)
+    assert compose(recipe, [f"trainer.default_root_dir={flags['default_root_dir']}"])
+
+
 @pytest.mark.parametrize(
     "sections",
     [
