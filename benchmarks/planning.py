@@ -32,7 +32,7 @@ from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
-from acwm_planning.futures import History, ModelRollouts
+from acwm_planning.futures import GoalCost, History, ModelRollouts
 from acwm_planning.run import make_cost, make_planner
 from acwm_planning.settings import settings_of
 
@@ -97,13 +97,14 @@ def measure(
     frame, _ = stage.reset(options={"spec": EpisodeSpec(card.name)})
     history, still = History(EpisodeSpec(card.name), [frame]), stage.environment.still_action()
     bounds = world.action_low, world.action_high
+    goal_cost = GoalCost(judge, stage.task, stage.goal)
     times: list[float] = []
     evaluations = 0
     while not times or sum(times[1:]) < seconds:
         if len(times) == 1:
             clock.seconds.clear()
         began = time.perf_counter()
-        costs = rollouts.cost(history, still, judge, stage.task, stage.goal, 0)
+        costs = rollouts.cost(history, still, goal_cost, 0)
         plan = searching.plan(costs, *bounds, torch.Generator().manual_seed(len(times)))
         times.append(time.perf_counter() - began)
         evaluations = plan.evaluations

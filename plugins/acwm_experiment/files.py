@@ -110,7 +110,7 @@ def read_experiment(
         raise RecipeError(
             f"{name} is not an experiment: it has no `rows` and no `plans` (docs/experiments.md)"
         )
-    sections = _Sections(**_typed(content, _Sections, ""))
+    sections = _Sections(**_check_types(content, _Sections, ""))
     cells, everywhere = tuple(_cells(sections.rows)), (*sections.overrides, *overrides)
     tasks = tuple(_tasks(sections.plans, *(((), None) if cells else (everywhere, seeds))))
     if not cells and not tasks:
@@ -150,7 +150,7 @@ def slug(text: str) -> str:
     return re.sub(r"[^\w.+=,-]+", "_", text).strip("_")
 
 
-def _typed(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
+def _check_types(values: Mapping[str, Any], owner: Any, prefix: str) -> dict[str, Any]:
     known = [each.name for each in fields(owner)]
     for name in values:
         if name not in known:
@@ -180,7 +180,7 @@ def _tasks(
         here = f"plans.{title}"
         if not content.get("tasks"):
             raise RecipeError(f"{here} has no `tasks`: give a row with a model and a task")
-        table = _Tasks(**_typed(content, _Tasks, f"{here}."))
+        table = _Tasks(**_check_types(content, _Tasks, f"{here}."))
         chosen = _episodes(f"{here}.seeds", table.seeds if seeds is None else seeds)
         for row, cell in table.tasks.items():
             if cell is not None:
@@ -212,7 +212,7 @@ def _data(key: str, values: Mapping[str, Any]) -> DataChoice:
     side = values.get("size")
     if isinstance(side, int):
         values = {**values, "size": [side, side]}
-    choice = DataChoice(**_typed(values, DataChoice, f"data.{key}."))
+    choice = DataChoice(**_check_types(values, DataChoice, f"data.{key}."))
     if choice.size and min(choice.size) < 1:
         raise RecipeError(f"data.{key}.size must be positive")
     train, *tests = choice.episodes or (1, 1)

@@ -75,13 +75,13 @@ class LocalRunner:
         try:
             while waiting or self._running:
                 self._start_what_can(waiting, failures)
-                for ended in [each for each in self._running if each.process.poll() is not None]:
-                    if reason := self._end(ended):
-                        failures[ended.step.name] = reason
+                for finished in [each for each in self._running if each.process.poll() is not None]:
+                    if reason := self._end(finished):
+                        failures[finished.step.name] = reason
                     count = len(steps) - len(waiting) - len(self._running)
-                    took = timedelta(seconds=round(time.monotonic() - ended.started))
+                    took = timedelta(seconds=round(time.monotonic() - finished.started))
                     how = f"FAILED after {took}: {reason}" if reason else f"done after {took}"
-                    self._say(f"[{count}/{len(steps)}] {ended.step.title}: {how}")
+                    self._say(f"[{count}/{len(steps)}] {finished.step.title}: {how}")
                 time.sleep(POLL)
         finally:
             self._stop()
@@ -122,17 +122,17 @@ class LocalRunner:
             )
         return _Running(step, process, time.monotonic(), gpu)
 
-    def _end(self, ended: _Running) -> str:
-        step, reason = ended.step, ""
-        with ended.process:  # closes its input
-            code = ended.process.wait()
+    def _end(self, finished: _Running) -> str:
+        step, reason = finished.step, ""
+        with finished.process:  # closes its input
+            code = finished.process.wait()
         if code or not self._is_done(step):
             reason = self._logs.last_line(step.name) or "none"
             if code <= 0:  # the last line it printed does not explain the failure
                 how = f"by {signal.Signals(-code).name}" if code else "without leaving a result"
                 reason = f"ended {how}; the last line of its log: {reason}"
-        self._running.remove(ended)
-        self._free.append(ended.gpu)
+        self._running.remove(finished)
+        self._free.append(finished.gpu)
         self._logs.set_state(step.name, "failed" if reason else "")
         return reason
 
@@ -157,14 +157,14 @@ class LocalRunner:
 @contextmanager
 def _signals_delayed() -> Generator[None]:
     """Handle Ctrl-C and SIGTERM only at the end of the block."""
-    numbers, came = (signal.SIGINT, signal.SIGTERM), list[int]()
-    before = [signal.signal(number, lambda caught, _: came.append(caught)) for number in numbers]
+    numbers, received = (signal.SIGINT, signal.SIGTERM), list[int]()
+    before = [signal.signal(number, lambda n, _: received.append(n)) for number in numbers]
     try:
         yield
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
-        for number in came[:1]:
+        for number in received[:1]:
             signal.raise_signal(number)
 
 
@@ -175,6 +175,6 @@ def visible_gpus() -> list[str]:
         return [name for name in chosen.split(",") if name]
     if shutil.which("nvidia-smi") is None:
         return []
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-    gpus = [line for line in listed.stdout.splitlines() if line.startswith("GPU ")]
+    listing = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+    gpus = [line for line in listing.stdout.splitlines() if line.startswith("GPU ")]
     return [str(number) for number in range(len(gpus))]

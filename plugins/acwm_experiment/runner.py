@@ -13,7 +13,7 @@ from acwm_executors.batch import BatchExecutor, JobState
 from acwm_experiment.local import LocalRunner
 from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.steps import Step, all_progress, all_steps, step_progress
-from acwm_experiment.table import FILE, Experiment
+from acwm_experiment.table import EXPERIMENT_FILE, Experiment
 
 Say = Callable[[str], None]
 """Prints a line for the user."""
@@ -38,7 +38,7 @@ def run_experiment(
         TrainingError: a folder holds another run.
     """
     steps = all_steps(plan, None if jobs == 1 else max(1, available_cores() // jobs))
-    with _prepared(plan, steps) as todo:
+    with _locked_folder(plan, steps) as todo:
         queued = [job.id for job in _jobs(plan).values() if job.state in ("queued", "running")]
         if queued:
             raise DataError(
@@ -82,7 +82,7 @@ def submit_experiment(
         RecipeError: the executor is not a batch system, or cannot work here.
     """
     queue = _queue(plan.folder / "jobs" / executor, options)
-    with _prepared(plan, all_steps(plan)) as todo:
+    with _locked_folder(plan, all_steps(plan)) as todo:
         new = queue.submit(todo, command, plan.logs.folder)
     for name, job in new.items():
         say(f"{name}: job {job}")
@@ -101,15 +101,15 @@ def _queue(folder: Path, options: Mapping[str, object] | None = None) -> BatchEx
 
 def _jobs(plan: ExperimentPlan) -> dict[str, JobState]:
     """The states of submitted jobs, by step; batch systems that are not available are skipped."""
-    found: dict[str, JobState] = {}
+    states: dict[str, JobState] = {}
     for folder in sorted((plan.folder / "jobs").glob("*")):
         with contextlib.suppress(RecipeError, MissingExtraError):
-            found |= _queue(folder).states()
-    return found
+            states |= _queue(folder).states()
+    return states
 
 
 @contextlib.contextmanager
-def _prepared(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[list[Step]]:
+def _locked_folder(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[list[Step]]:
     """Create and lock the experiment's folder with `experiment.json`, and yield the steps left.
 
     Raises:
@@ -120,12 +120,12 @@ def _prepared(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[list[Ste
         try:
             plan.logs.folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(held(folder))
-            there = Experiment.read(folder) if (folder / FILE).exists() else None
-            if there and there.name != experiment.name:
+            existing = Experiment.read(folder) if (folder / EXPERIMENT_FILE).exists() else None
+            if existing and existing.name != experiment.name:
                 raise DataError(
-                    f"{folder} holds the experiment {there.name!r}: choose another --out"
+                    f"{folder} holds the experiment {existing.name!r}: choose another --out"
                 )
-            if there != experiment:
+            if existing != experiment:
                 experiment.write(folder)
         except OSError as error:
             raise DataError(f"cannot write to {folder} ({error.strerror})") from error
@@ -164,9 +164,9 @@ def _state(
     note = f"{saved} of {whole} {unit}" if saved else ""
     if job and job.state in ("queued", "running"):
         return job.state, f"job {job.id}" + (f", {note}" if note else "")
-    here = plan.logs.state(step.name)
-    if here == "running" and busy:
-        return here, note
-    if here == "failed" or (job and job.state == "failed"):
+    state = plan.logs.state(step.name)
+    if state == "running" and busy:
+        return state, note
+    if state == "failed" or (job and job.state == "failed"):
         return "failed", f"{plan.logs.last_line(step.name)}; see {plan.logs.log(step.name)}"
     return "to do", note

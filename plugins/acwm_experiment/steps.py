@@ -20,9 +20,9 @@ from acwm_executors.batch import Job
 from acwm_experiment.files import slug
 from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.runs import DatasetSpec, RunSpec
-from acwm_experiment.table import FILE, SUMMARY
+from acwm_experiment.table import EXPERIMENT_FILE, RUN_SUMMARY
 from acwm_experiment.tasks import PlanCommand
-from acwm_planning.jobs import SUMMARY as PLAN_SUMMARY
+from acwm_planning.jobs import PLAN_SUMMARY
 
 WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
 """Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""
@@ -122,7 +122,7 @@ def step_progress(step: Step, plan: ExperimentPlan) -> float:
         run = step.task.run
         ready = run is None or training_progress(run) == 1  # else it will have other weights
         return step.task.job.progress() if ready else 0.0
-    shown = [plan.folder / FILE, *(run.folder / SUMMARY for run in plan.runs)]
+    shown = [plan.folder / EXPERIMENT_FILE, *(run.folder / RUN_SUMMARY for run in plan.runs)]
     shown += [task.job.folder / PLAN_SUMMARY for task in plan.tasks]
     newest = max((path.stat().st_mtime_ns for path in shown if path.exists()), default=0)
     return float(plan.report.exists() and plan.report.stat().st_mtime_ns >= newest)
@@ -145,16 +145,16 @@ def dataset_is_whole(dataset: DatasetSpec) -> bool:
     if not (dataset.path / CARD).is_file():
         return False
     card, choice = DatasetCard.read(dataset.path), dataset.choice
-    there = card.environment
-    if there.name != dataset.environment or choice.size not in (None, there.frame_size):
+    environment = card.environment
+    if environment.name != dataset.environment or choice.size not in (None, environment.frame_size):
         return False
     if card.source:  # a recorded dataset has no requested size
         return all(split in card.checksums for split in card.splits)
-    usual = tuple(there.episodes.get(split, 0) for split in SPLITS)
+    usual = tuple(environment.episodes.get(split, 0) for split in SPLITS)
     pairs = zip(SPLITS, choice.episodes or usual, strict=True)
     whole = all(card.splits.get(s) == n and s in card.checksums for s, n in pairs if n)
-    made = (card.seed, card.exploration, dict(card.factors))
-    return whole and made == (choice.seed, choice.exploration, {})
+    origin = (card.seed, card.exploration, dict(card.factors))
+    return whole and origin == (choice.seed, choice.exploration, {})
 
 
 def training_progress(run: RunSpec) -> float:
@@ -181,9 +181,9 @@ def saved_steps(run: Path) -> int:
     """The optimiser steps of the weights in a run folder; 0 if there are no readable weights."""
     import safetensors
 
-    opened = cast(Any, safetensors).safe_open
+    safe_open = cast(Any, safetensors).safe_open
     try:
-        with opened(run / WEIGHTS, framework="np") as file:
+        with safe_open(run / WEIGHTS, framework="np") as file:
             metadata: dict[str, str] = file.metadata() or {}
         return int(parse_json(metadata["acwm"])["step"])
     except (OSError, safetensors.SafetensorError, LookupError, TypeError, ValueError):
@@ -192,13 +192,13 @@ def saved_steps(run: Path) -> int:
 
 def is_evaluated(run: RunSpec) -> bool:
     """Whether the weights of a finished run were evaluated with its current recipe."""
-    summary, weights = run.folder / SUMMARY, run.folder / WEIGHTS
+    summary, weights = run.folder / RUN_SUMMARY, run.folder / WEIGHTS
     try:
-        found: Mapping[str, Any] = parse_json(summary.read_bytes())["provenance"]
+        provenance: Mapping[str, Any] = parse_json(summary.read_bytes())["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
-        settings = {**EvaluationConfig().to_dict(), **found["evaluation"]}  # some may be new
+        settings = {**EvaluationConfig().to_dict(), **provenance["evaluation"]}  # some may be new
         same = settings == EvaluationConfig(**run.recipe.evaluation).to_dict()
-        return newer and same and found["training_steps"] == run.max_steps
+        return newer and same and provenance["training_steps"] == run.max_steps
     except (OSError, ValueError, LookupError, TypeError, DataError):
         return False
 
@@ -208,9 +208,9 @@ def evaluation_overrides(run: RunSpec) -> list[str]:
 
     Its own recipe may say something else, for example the defaults when it was trained.
     """
-    wanted = EvaluationConfig(**run.recipe.evaluation).to_dict()
-    listed = read_recipe(recipe_folder() / "base.yaml")["evaluation"]
-    overrides = setting_overrides({**EvaluationConfig().to_dict(), **listed}, wanted)
+    evaluation = EvaluationConfig(**run.recipe.evaluation).to_dict()
+    defaults = read_recipe(recipe_folder() / "base.yaml")["evaluation"]
+    overrides = setting_overrides({**EvaluationConfig().to_dict(), **defaults}, evaluation)
     if (run.folder / RECIPE).is_file():
-        overrides += setting_overrides(_recipe(run.folder / RECIPE).evaluation, wanted)
+        overrides += setting_overrides(_recipe(run.folder / RECIPE).evaluation, evaluation)
     return list(dict.fromkeys(overrides))

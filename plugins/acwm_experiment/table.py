@@ -11,13 +11,13 @@ from acwm_core.errors import DataError
 from acwm_core.files import parse_json, typed, written_whole
 from acwm_planning.jobs import PlanningJob
 
-FILE = "experiment.json"
+EXPERIMENT_FILE = "experiment.json"
 
-SUMMARY = Path("evaluation", "summary.json")
+RUN_SUMMARY = Path("evaluation", "summary.json")
 """File that a run folder holds once it is evaluated."""
 
 FORMAT = 1
-"""Version of `FILE`."""
+"""Version of `EXPERIMENT_FILE`."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Experiment:
             cell["runs"] = [*map(stored, cell["runs"])]
         for plan in values["plans"]:
             plan |= {name: stored(plan[name]) for name in ("run", "folder")}
-        with written_whole(folder / FILE) as partial:
+        with written_whole(folder / EXPERIMENT_FILE) as partial:
             text = json.dumps({"format": FORMAT, **values}, indent=1, ensure_ascii=False)
             partial.write_text(text + "\n", encoding="utf-8")
 
@@ -84,7 +84,7 @@ class Experiment:
         Raises:
             DataError: the folder holds no experiment, or one from another version, or damaged.
         """
-        file = Path(folder) / FILE
+        file = Path(folder) / EXPERIMENT_FILE
         try:
             values = parse_json(file.read_bytes())
             if values["format"] != FORMAT:
@@ -96,11 +96,11 @@ class Experiment:
                 plan |= {name: str(Path(folder, plan[name])) for name in ("run", "folder")}
             return typed(values, cls)
         except (FileNotFoundError, NotADirectoryError):
-            raise DataError(f"{folder} holds no experiment: it has no {FILE}") from None
+            raise DataError(f"{folder} holds no experiment: it has no {EXPERIMENT_FILE}") from None
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise DataError(f"{file} is damaged ({type(error).__name__}: {error})") from None
 
 
 def is_experiment(folder: str | Path) -> bool:
     """Whether a folder holds an experiment."""
-    return (Path(folder) / FILE).is_file()
+    return (Path(folder) / EXPERIMENT_FILE).is_file()

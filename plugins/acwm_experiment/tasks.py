@@ -60,21 +60,20 @@ def plan_commands(
     Raises:
         RecipeError: there is no such model, task, setting or row, or two rows are the same.
     """
-    found: dict[str, PlanCommand] = {}
+    commands: dict[str, PlanCommand] = {}
     for choice in choices:
         try:
-            made = [
-                _task_plan(choice, model, folder) for model in _models(choice, experiment, runs)
-            ]
+            models = _models(choice, experiment, runs)
+            new = [_plan_command(choice, model, folder) for model in models]
         except AcwmError as error:
             raise RecipeError(f"plans.{choice.table}.tasks.{choice.row}: {error}") from error
-        for each in made:
-            if (first := found.setdefault(each.name, each)) is not each:
+        for each in new:
+            if (first := commands.setdefault(each.name, each)) is not each:
                 raise RecipeError(
                     f"{first.job.title} and {each.job.title} would both be {each.name}: "
                     "give them different settings, or leave one out"
                 )
-    return tuple(found.values())
+    return tuple(commands.values())
 
 
 def _models(
@@ -82,7 +81,7 @@ def _models(
 ) -> Iterator[_Model]:
     cells = {cell.title: cell for cell in experiment.cells}
     if choice.model not in cells:
-        yield _existing(choice, [*cells])
+        yield _existing_model(choice, [*cells])
         return
     for seed, folder in zip(experiment.seeds, cells[choice.model].runs, strict=True):
         run, several = runs[folder], len(experiment.seeds) > 1
@@ -91,7 +90,7 @@ def _models(
         yield _Model(str(folder), folder, folder, env, label, run)
 
 
-def _existing(choice: TaskChoice, cells: Sequence[str]) -> _Model:
+def _existing_model(choice: TaskChoice, cells: Sequence[str]) -> _Model:
     source = find_run(choice.model)
     if not (source / "recipe.yaml").is_file():
         near = suggest(choice.model, [*cells, *trained_models()])
@@ -108,7 +107,7 @@ def _environment(folder: Path) -> str:
     return DatasetCard.read(folder / CARD).environment.name
 
 
-def _task_plan(choice: TaskChoice, model: _Model, folder: Path) -> PlanCommand:
+def _plan_command(choice: TaskChoice, model: _Model, folder: Path) -> PlanCommand:
     task = catalog().component("environment", model.environment).load_task(choice.task)
     settings = settings_of(choice.overrides, declared=task.planning)
     rows = settings.rows(choice.rows)

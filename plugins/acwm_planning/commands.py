@@ -52,19 +52,19 @@ def plan(
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
     """
-    from acwm_planning.settings import ROWS, settings_of
+    from acwm_planning.settings import ROW_NAMES, settings_of
 
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)
 
     from acwm_core.executors import progress_bar
-    from acwm_planning.run import declared_by, plan_episodes
+    from acwm_planning.run import declared_settings, plan_episodes
 
-    settings = settings_of(overrides, preset, declared_by(run, task))
+    settings = settings_of(overrides, preset, declared_settings(run, task))
     if compare and settings.differentiates and not rows:
         click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
-        rows = tuple(row for row in ROWS if row not in ("simulator", "codec"))
-    chosen = settings.rows(rows or (ROWS if compare else ("model",)))
+        rows = tuple(row for row in ROW_NAMES if row not in ("simulator", "codec"))
+    chosen = settings.rows(rows or (ROW_NAMES if compare else ("model",)))
 
     where = out or run / "planning" / task
     with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
 from acwm_core.errors import PluginError, RecipeError, check_shape
-from acwm_planning.futures import History
+from acwm_planning.futures import GoalCost, History
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_planning.search import SearchPlanner
 
@@ -47,7 +47,6 @@ class StillController(Controller):
     """Always takes the action that means no motion."""
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        """See `Controller`."""
         self._environment = environment
 
     def act(self, history: History) -> Actions:
@@ -62,7 +61,6 @@ class RandomController(Controller):
         self._block = action_block
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        """See `Controller`."""
         self._space = environment.action_space
         self._rng = environment.episode_spec.rng("random actions")
 
@@ -85,11 +83,10 @@ class ScriptedController(Controller):
         self._policy: Policy | None = None
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        """See `Controller`."""
         rng, action = environment.episode_spec.rng("policy"), environment.card.action
         self._low, self._high = np.array(action.low), np.array(action.high)
         self._method = "solution" if self._solves else "policy"
-        self._task = task if self._solves else environment
+        self._script_owner = task if self._solves else environment
         if self._solves:
             self._policy = task.solution(environment, goal, rng)
         else:
@@ -101,8 +98,8 @@ class ScriptedController(Controller):
         """One action, because the script looks at the simulator before each action."""
         assert self._policy is not None
         action = np.asarray(self._policy())
-        check_shape(self._task, self._method, action, len(self._low))
-        check_bounds(self._task, self._method, action, self._low, self._high)
+        check_shape(self._script_owner, self._method, action, len(self._low))
+        check_bounds(self._script_owner, self._method, action, self._low, self._high)
         return [action.astype(np.float32)]
 
 
@@ -110,13 +107,7 @@ class Rollouts(Protocol):
     """Predicts the futures of candidates: `ModelRollouts` or `SimulatorRollouts`."""
 
     def cost(
-        self,
-        history: History,
-        still: NDArray[np.float32],
-        judge: Cost,
-        task: Task,
-        goal: Goal,
-        seed: int,
+        self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
     ) -> RolloutCost:
         """A function that maps candidates, which continue `history`, to their costs."""
         ...
@@ -138,7 +129,7 @@ class PlanningController(Controller):
     Args:
         planner: the planner.
         rollouts: predicts the futures of its candidates.
-        judge: cost of the futures.
+        cost: cost of the futures.
         seed: added to the episode's seed, for the planner's randomness and the model's noise.
         usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
 
@@ -153,16 +144,15 @@ class PlanningController(Controller):
         self,
         planner: Planner,
         rollouts: Rollouts,
-        judge: Cost,
+        cost: Cost,
         seed: int = 0,
         usual: Sequence[float] | None = None,
     ) -> None:
-        self.rollouts, self._planner, self._judge, self._seed = rollouts, planner, judge, seed
+        self.rollouts, self._planner, self._cost, self._seed = rollouts, planner, cost, seed
         self._usual = None if usual is None else torch.tensor(usual, dtype=torch.float32)
         self.decisions: list[Decision] = []
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        """See `Controller`."""
         rng = environment.episode_spec.rng("planner")
         still, seed = environment.still_action(), int(rng.integers(2**31))
         self.aim(task, goal, environment.card.action, still, seed)
@@ -181,7 +171,7 @@ class PlanningController(Controller):
         """
         self._planner.reset()
         self.decisions, self.still = [], still
-        self._task, self._goal = task, goal
+        self._goal_cost = GoalCost(self._cost, task, goal)
         self._low, self._high = torch.tensor(action.low), torch.tensor(action.high)
         self._absolute = action.kind == "absolute"
         self._base = seed + self._seed
@@ -189,20 +179,20 @@ class PlanningController(Controller):
 
     def act(self, history: History) -> Actions:
         """The first actions of a new plan."""
-        began = time.perf_counter()
+        start = time.perf_counter()
         seed = self._base + len(self.decisions)
-        self._say_where(history)
-        cost = self.rollouts.cost(history, self.still, self._judge, self._task, self._goal, seed)
+        self._set_region(history)
+        cost = self.rollouts.cost(history, self.still, self._goal_cost, seed)
         plan = self._planner.plan(cost, self._low, self._high, self._generator)
-        seconds, taken = time.perf_counter() - began, self._planner.actions_per_plan
-        first = self._checked(plan)[: max(0, taken)]
+        seconds, count = time.perf_counter() - start, self._planner.actions_per_plan
+        first = self._valid_actions(plan)[: max(0, count)]
         if not len(first):
             owner = type(self._planner).__name__
-            raise PluginError(f"{owner} plans no actions, or actions_per_plan = {taken} takes none")
+            raise PluginError(f"{owner} plans no actions, or actions_per_plan = {count} takes none")
         self.decisions.append(Decision(len(history.actions), plan, seconds, seed))
         return [*first]
 
-    def _say_where(self, history: History) -> None:
+    def _set_region(self, history: History) -> None:
         """Set the region that a planner of this package searches.
 
         The search starts from the action that means no motion. The environment gives that action
@@ -217,7 +207,7 @@ class PlanningController(Controller):
         usual = None if self._usual is None else self._usual / half
         self._planner.search_near((rest - self._low) / half - 1, usual)
 
-    def _checked(self, plan: Plan) -> NDArray[np.float32]:
+    def _valid_actions(self, plan: Plan) -> NDArray[np.float32]:
         """The actions `[T, A]` of a valid plan.
 
         Raises:

@@ -15,8 +15,8 @@ from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.shapes import Actions
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.controllers import PlanningController, Rollouts
-from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.planner import Cost, Driver, RolloutCost
+from acwm_planning.futures import GoalCost, History, ModelRollouts
+from acwm_planning.planner import Driver, RolloutCost
 from acwm_planning.run import make_cost, make_planner
 from acwm_planning.settings import settings_of
 
@@ -46,16 +46,15 @@ class PlanningDriver(Driver):
         usual: Sequence[float] | None = None,
         steps: int | None = None,
     ) -> None:
-        asked = [] if steps is None else [f"steps={steps}"]
-        settings = settings_of(asked, declared=task.planning)
+        overrides = [] if steps is None else [f"steps={steps}"]
+        settings = settings_of(overrides, declared=task.planning)
         estimator = estimator_for(card) if settings.estimates else None
         rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
-        self._card, self._task, self._rollouts = card, task, _Watched(rollouts)
-        planner, judge = make_planner(settings), make_cost(settings)
-        self._controller = PlanningController(planner, self._rollouts, judge, usual=usual)
+        self._card, self._task, self._rollouts = card, task, _InterruptibleRollouts(rollouts)
+        planner, cost = make_planner(settings), make_cost(settings)
+        self._controller = PlanningController(planner, self._rollouts, cost, usual=usual)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
-        """See `Driver.begin`."""
         self._controller.aim(self._task, goal, self._card.action, still, seed)
 
     def act(
@@ -70,7 +69,7 @@ class PlanningDriver(Driver):
         return self._controller.act(History(spec, list(frames), list(actions)))
 
 
-class _Watched:
+class _InterruptibleRollouts:
     """Rollouts that call `check` before candidates are rolled out."""
 
     check: Callable[[], None]
@@ -79,19 +78,12 @@ class _Watched:
         self._rollouts = rollouts
 
     def cost(
-        self,
-        history: History,
-        still: NDArray[np.float32],
-        judge: Cost,
-        task: Task,
-        goal: Goal,
-        seed: int,
+        self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
     ) -> RolloutCost:
-        """See `Rollouts.cost`."""
-        cost = self._rollouts.cost(history, still, judge, task, goal, seed)
+        cost = self._rollouts.cost(history, still, goal_cost, seed)
 
-        def watched(actions: Actions) -> Tensor:
+        def interruptible(actions: Actions) -> Tensor:
             self.check()
             return cost(actions)
 
-        return watched
+        return interruptible

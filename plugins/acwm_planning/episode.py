@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.environment import Environment, EnvironmentCard, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, TaskEnvironment
@@ -35,7 +35,6 @@ class TaskVariant(Task):
         self.max_steps = max_steps or task.max_steps
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
-        """See `Task.sample_goal`."""
         if self._steps is None:
             return self._task.sample_goal(environment, rng)
         act = environment.policy(rng)
@@ -44,22 +43,24 @@ class TaskVariant(Task):
         return Goal.now(environment)
 
     def distance(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """See `Task.distance`."""
         return self._task.distance(seen, goal)
 
     def failed(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """See `Task.failed`."""
         return self._task.failed(seen, goal)
 
     def success(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """See `Task.success`."""
         return self._task.success(seen, goal)
 
     def solution(
         self, environment: Environment, goal: Goal, rng: np.random.Generator
     ) -> Policy | None:
-        """See `Task.solution`. None with `steps`: the script may only know the task's own goals."""
+        """None with `steps`: the script may only know the task's own goals."""
         return self._task.solution(environment, goal, rng) if self._steps is None else None
+
+
+def spec_of_seed(card: EnvironmentCard, seed: int) -> EpisodeSpec:
+    """The episode of a seed: its number in the test split, on which no model was trained."""
+    return EpisodeSpec(card.name, "ind_test", seed, options={"size": card.frame_size})
 
 
 @dataclass(frozen=True)
@@ -75,20 +76,20 @@ class EpisodeResult:
 
     def facts(self) -> dict[str, Any]:
         """A summary that can be written as JSON."""
-        made = self.decisions
         facts: dict[str, Any] = {
             "success": self.success,
             "failed": self.failed,
             "steps": len(self.history.actions),
             "start_distance": self.distances[0],
             "distance": self.distances[-1],
-            "decisions": len(made),
+            "decisions": len(self.decisions),
         }
-        if made:
-            facts["seconds_per_decision"] = float(np.mean([each.seconds for each in made]))
-            facts["rollouts_per_decision"] = float(
-                np.mean([each.plan.evaluations for each in made])
+        if self.decisions:
+            facts["seconds_per_decision"] = float(
+                np.mean([each.seconds for each in self.decisions])
             )
+            evaluations = [each.plan.evaluations for each in self.decisions]
+            facts["rollouts_per_decision"] = float(np.mean(evaluations))
         return facts
 
 

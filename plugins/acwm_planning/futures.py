@@ -15,6 +15,7 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
@@ -37,15 +38,25 @@ class History:
     actions: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
 
 
-def tensor_of(frames: Sequence[Frame]) -> Video:
-    """Convert T frames `[H, W, 3]` to a video `[1, T, 3, H, W]` in [0, 1]."""
-    return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)[None].float() / 255
+@dataclass(frozen=True)
+class GoalCost:
+    """The cost of reaching a goal: a `Cost` with what it is asked about."""
+
+    cost: Cost
+    task: Task
+    goal: Goal
+
+    def __call__(self, futures: Futures, number: int) -> Tensor:
+        """Costs `[number]` of the futures of so many candidates."""
+        costs = self.cost(futures, self.task, self.goal)
+        check_shape(self.cost, "__call__", costs, number)
+        return costs
 
 
 def still_latent(codec: Codec, picture: Frame) -> Latent:
     """Encode a still picture as a latent frame, as it is after a video's first frame."""
     device = next((p.device for p in codec.parameters()), torch.device("cpu"))
-    video = tensor_of([picture] * (1 + codec.temporal_stride)).to(device)
+    video = as_clip(np.stack([picture] * (1 + codec.temporal_stride)))[None].to(device)
     with torch.no_grad():
         return codec.encode(video)[:, -1:]
 
@@ -81,21 +92,21 @@ class ModelFutures(Futures):
         return self._latents.detach().isfinite().flatten(1).all(1)
 
     def latents(self, frames: Sequence[int]) -> Latent:
-        """See `Futures.latents`. They carry a gradient if the predicted latents do."""
+        """They carry a gradient if the predicted latents do."""
         return self._latents[:, list(frames)]
 
     @torch.no_grad()
     def video(self, frames: Sequence[int]) -> Video:
-        """See `Futures.video`. With a memoryless codec, only these frames are decoded.
+        """With a memoryless codec, only these frames are decoded.
 
         On a CPU that has it, in bfloat16: decoding takes most of a decision, and is twice as fast.
         """
         device = self._latents.device.type
         fast = device == "cpu" and cpu_has_fast_bfloat16()
         with torch.autocast(device, torch.bfloat16, enabled=fast):
-            return self._decoded(list(frames)).float()
+            return self._decode(list(frames)).float()
 
-    def _decoded(self, chosen: list[int]) -> Video:
+    def _decode(self, chosen: list[int]) -> Video:
         stride = self._codec.temporal_stride
         places = [self._last if frame == self.length - 1 else stride - 1 for frame in chosen]
         if self._codec.memoryless:
@@ -108,7 +119,7 @@ class ModelFutures(Futures):
         return video[:, [start + place for start, place in zip(starts, places, strict=True)]]
 
     def observe(self, frames: Sequence[int]) -> Observation:
-        """See `Futures.observe`. The estimator reads the decoded frames.
+        """The estimator reads the decoded frames.
 
         Raises:
             DataError: there is no estimator for this environment.
@@ -121,7 +132,7 @@ class ModelFutures(Futures):
         return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 
     def still(self, picture: Frame) -> Latent:
-        """See `Futures.still`. Each picture is encoded once per decision."""
+        """Each picture is encoded once per decision."""
         if id(picture) not in self._stills:
             self._stills[id(picture)] = still_latent(self._codec, picture)
         return self._stills[id(picture)]
@@ -144,9 +155,6 @@ class ModelRollouts:
             a model with a single context frame how fast things move.
         steps: sampling steps; the model's own number by default.
         batch: number of candidates that are rolled out at once.
-
-    Raises:
-        RecipeError: a number is too small.
     """
 
     def __init__(
@@ -159,61 +167,45 @@ class ModelRollouts:
         steps: int | None = None,
         batch: int = 128,
     ) -> None:
-        for name, value, least in (
-            ("past", past, 0),
-            ("steps", 1 if steps is None else steps, 1),
-            ("batch", batch, 1),
-        ):
-            if value < least:
-                raise RecipeError(f"{name}={value}: give {least} or more")
         self.world_model, self.card = world_model, card
         self._estimator, self._past, self._steps, self._batch = estimator, past, steps, batch
 
     def cost(
-        self,
-        history: History,
-        still: NDArray[np.float32],
-        judge: Cost,
-        task: Task,
-        goal: Goal,
-        seed: int,
+        self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
     ) -> RolloutCost:
         """A function that maps candidates `[N, T, A]`, which continue `history`, to costs `[N]`.
 
         Args:
             history: the episode so far.
             still: the action that means no motion, assumed before the start.
-            judge: cost of the candidates' futures.
-            task: task to solve.
-            goal: its goal.
+            goal_cost: cost of the candidates' futures.
             seed: seed of the model's noise.
         """
-        given, taken = self._encoded(history, still)
+        given, taken = self._encode(history, still)
         stills: dict[int, Latent] = {}
 
         def cost(actions: Actions) -> Tensor:
             costs: list[Tensor] = []
             for part in actions.split(self._batch):
                 futures = self._futures(given, taken, part, seed, stills)
-                found = judge(futures, task, goal).cpu()
-                check_shape(judge, "__call__", found, len(part))
                 # An estimator may read something from a picture that is not finite.
-                costs.append(torch.where(futures.finite.cpu(), found, torch.nan))
+                finite, readable = futures.finite.cpu(), goal_cost(futures, len(part)).cpu()
+                costs.append(torch.where(finite, readable, torch.nan))
             return torch.cat(costs)
 
         return cost
 
     @torch.no_grad()
-    def imagined(
+    def imagine(
         self, history: History, still: NDArray[np.float32], actions: Tensor, seed: int
     ) -> Clip:
         """Predict the video `[T, 3, H, W]` of one candidate `[T, A]`."""
-        given, taken = self._encoded(history, still)
-        latents = self._predicted(given, taken, actions[None], seed)
+        given, taken = self._encode(history, still)
+        latents = self._predict(given, taken, actions[None], seed)
         frames = self.world_model.codec.decode(latents)[0]
-        return frames[self._known(given, taken) :][: len(actions)].cpu()
+        return frames[self._known_frames(given, taken) :][: len(actions)].cpu()
 
-    def _encoded(self, history: History, still: NDArray[np.float32]) -> tuple[Latent, Tensor]:
+    def _encode(self, history: History, still: NDArray[np.float32]) -> tuple[Latent, Tensor]:
         """Latents of the given frames `[1, K, C, h, w]`, and the actions `[1, n, A]` up to now."""
         world = self.world_model
         known, stride = world.context_frames, world.codec.temporal_stride
@@ -223,7 +215,7 @@ class ModelRollouts:
         actions = [still] * before + history.actions
         first = len(frames) - past - known
         device = world.action_low.device
-        given = world.encode(tensor_of(frames[first : first + known]).to(device))
+        given = world.encode(as_clip(np.stack(frames[first : first + known]))[None].to(device))
         taken = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
         return given, torch.from_numpy(taken)
 
@@ -231,14 +223,14 @@ class ModelRollouts:
         self, given: Latent, taken: Tensor, actions: Actions, seed: int, stills: dict[int, Latent]
     ) -> ModelFutures:
         with torch.set_grad_enabled(actions.requires_grad):
-            latents = self._predicted(given, taken, actions, seed)
+            latents = self._predict(given, taken, actions, seed)
         codec = self.world_model.codec
-        now = codec.latent_frames(self._known(given, taken))
+        now = codec.latent_frames(self._known_frames(given, taken))
         last = (actions.shape[1] - 1) % codec.temporal_stride
         before, after = latents[:, :now], latents[:, now:]
         return ModelFutures(codec, after, before, last, self._estimator, stills)
 
-    def _predicted(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> Latent:
+    def _predict(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> Latent:
         """All latent frames, including the given ones, `[N, L, C, h, w]`."""
         world, number = self.world_model, len(actions)
         rows = torch.cat([taken.expand(number, -1, -1), actions], 1).to(world.action_low.device)
@@ -262,6 +254,6 @@ class ModelRollouts:
             world.model, given, conditioning, length, generators, self._steps
         )
 
-    def _known(self, given: Latent, taken: Tensor) -> int:
+    def _known_frames(self, given: Latent, taken: Tensor) -> int:
         """Number of video frames from the first given one to the current one."""
         return 1 + taken.shape[1]

@@ -14,7 +14,7 @@ from acwm_core.files import parse_json
 PLANS = "planning"
 """Folder within a run folder, or an experiment's, with a folder of results for each task."""
 
-SUMMARY = "summary.json"
+PLAN_SUMMARY = "summary.json"
 """File that `acwm plan` writes after every episode into a folder of results."""
 
 
@@ -28,7 +28,7 @@ class PlanningJob:
     environment: str  # registered name
     task: str  # name of a task of the environment
     settings: Mapping[str, Any]  # settings of planning, as `Settings.to_dict` returns them
-    rows: tuple[str, ...]  # what chooses the actions, of `settings.ROWS`
+    rows: tuple[str, ...]  # what chooses the actions, of `settings.ROW_NAMES`
     seeds: tuple[int, ...]  # numbers of the episodes, the same for all rows
     folder: Path  # folder of the results
 
@@ -49,15 +49,15 @@ class PlanningJob:
         as a scripted solution, are not missing.
         """
         try:
-            made: Mapping[str, Any] = parse_json((self.folder / SUMMARY).read_bytes())
-            asked = {"environment": self.environment, "task": self.task, **self.settings}
-            if any(made.get(name) != value for name, value in asked.items()):
+            summary: Mapping[str, Any] = parse_json((self.folder / PLAN_SUMMARY).read_bytes())
+            settings = {"environment": self.environment, "task": self.task, **self.settings}
+            if any(summary.get(name) != value for name, value in settings.items()):
                 return 0.0
-            if made["file_sha256"] != file_sha256(self.run / "model.safetensors"):
+            if summary["file_sha256"] != file_sha256(self.run / "model.safetensors"):
                 return 0.0
-            there = {(row["row"], seed) for row in made["rows"] for seed in row["seeds"]}
-            left_out = made.get("left_out", ())
-            wanted = {(row, n) for row in self.rows if row not in left_out for n in self.seeds}
-            return 1.0 if wanted <= there else len(wanted & there) / len(wanted)
+            present = {(row["row"], seed) for row in summary["rows"] for seed in row["seeds"]}
+            left_out = summary.get("left_out", ())
+            required = {(row, n) for row in self.rows if row not in left_out for n in self.seeds}
+            return 1.0 if required <= present else len(required & present) / len(required)
         except (OSError, ValueError, LookupError, TypeError, AttributeError, DataError):
             return 0.0

@@ -10,10 +10,10 @@ from jinja2 import Environment, select_autoescape
 
 from acwm_core.files import writing, written_whole
 from acwm_core.recipe.types import show
-from acwm_planning.settings import ROWS
+from acwm_planning.settings import ROW_NAMES
 from acwm_planning.table import VIDEOS, RowSummary
 
-PAGE = "index.html"
+PAGE_FILE = "index.html"
 
 _TEMPLATE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -62,7 +62,7 @@ def write_page(
         rows: the table.
     """
     videos: list[dict[str, str]] = []
-    for row in ROWS:
+    for row in ROW_NAMES:
         panels = "happened, imagined, goal" if row == "model" else "happened, goal"
         for file in sorted((folder / VIDEOS).glob(f"{row}-*.mp4")):
             seed = file.stem.rpartition("-")[2].lstrip("0") or "0"
@@ -72,7 +72,7 @@ def write_page(
     text = template.render(
         title=title, settings=" ".join(_words(settings)), rows=rows, videos=videos
     )
-    page = folder / PAGE
+    page = folder / PAGE_FILE
     with writing(page), written_whole(page) as partial:
         partial.write_text(text, encoding="utf-8")
     return page

@@ -12,7 +12,7 @@ from typing import Any
 from acwm_core.errors import DataError
 from acwm_core.files import held, parse_json, writing, written_whole
 
-EPISODES, SETTINGS = "episodes.jsonl", "settings.json"
+EPISODES_FILE, SETTINGS_FILE = "episodes.jsonl", "settings.json"
 """Files in the folder."""
 
 Line = Mapping[str, Any]
@@ -28,31 +28,33 @@ class ResumableResults:
     keys: tuple[str, str] = ("row", "seed")  # the keys of a line that identify its episode
 
     def __post_init__(self) -> None:
-        asked, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS
+        settings, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS_FILE
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             with held(self.folder):  # of two commands with different settings, one is refused
                 if not path.exists():
                     with written_whole(path) as partial:
-                        partial.write_text(json.dumps(asked, indent=1), encoding="utf-8")
-        found: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
-        other = sorted(name for name in {*asked, *found} if asked.get(name) != found.get(name))
-        if other:
+                        partial.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+        stored: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
+        differences = sorted(
+            name for name in {*settings, *stored} if settings.get(name) != stored.get(name)
+        )
+        if differences:
             raise DataError(
-                f"{self.folder} holds results of another {', '.join(other)}: choose another --out, "
-                "or delete it"
+                f"{self.folder} holds results of another {', '.join(differences)}: choose another "
+                "--out, or delete it"
             )
 
     def finished(self) -> list[Line]:
         """The results of all finished episodes, without lines that were only partly written."""
-        path, found = self.folder / EPISODES, dict[tuple[str, int], Line]()
+        path, lines = self.folder / EPISODES_FILE, dict[tuple[str, int], Line]()
         for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
             try:
                 line: dict[str, Any] = parse_json(text)
-                found[str(line[self.keys[0]]), int(line[self.keys[1]])] = line
+                lines[str(line[self.keys[0]]), int(line[self.keys[1]])] = line
             except (ValueError, KeyError, TypeError, DataError):
                 continue
-        return list(found.values())
+        return list(lines.values())
 
     @contextlib.contextmanager
     def adding(self) -> Generator[None]:
@@ -65,12 +67,12 @@ class ResumableResults:
             try:
                 yield
             finally:
-                if not (self.folder / EPISODES).exists():
-                    (self.folder / SETTINGS).unlink(missing_ok=True)
+                if not (self.folder / EPISODES_FILE).exists():
+                    (self.folder / SETTINGS_FILE).unlink(missing_ok=True)
 
     def add(self, *lines: Line) -> None:
         """Append results at once, on a new line if the last line was cut off."""
-        path = self.folder / EPISODES
+        path = self.folder / EPISODES_FILE
         text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
         with writing(path), path.open("a+b") as file:
             if file.tell() and path.read_bytes()[-1:] != b"\n":

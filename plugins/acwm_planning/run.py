@@ -11,7 +11,6 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
@@ -26,18 +25,15 @@ from acwm_planning.controllers import (
     ScriptedController,
     StillController,
 )
-from acwm_planning.episode import EpisodeResult, TaskVariant, play
+from acwm_planning.episode import EpisodeResult, TaskVariant, play, spec_of_seed
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.page import write_page
 from acwm_planning.planner import Cost, Planner
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import VIDEOS, RowSummary, left, summarise, write_summary
-from acwm_planning.video import episode_curves, imagined, write_episode
-
-SPLIT = "ind_test"
-"""Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
+from acwm_planning.table import VIDEOS, RowSummary, missing_episodes, summarise, write_summary
+from acwm_planning.video import draw_curves, imagine, write_episode
 
 
 class EpisodePlayer:
@@ -66,11 +62,11 @@ class EpisodePlayer:
         self.card, self.settings, self._usual = bundle.card, settings, usual
         self._world = bundle.world_model.to(choose_device(device))
         component = catalog().component("environment", self.card.name)
-        found: Task = component.load_task(task)
-        steps, most = settings.goal_ahead, settings.max_steps
-        varied = steps is not None or most is not None
-        asked = TaskVariant(found, steps=steps, max_steps=most) if varied else found
-        self.environment = TaskEnvironment(self._environment(), asked)
+        goal_task: Task = component.load_task(task)
+        steps, limit = settings.goal_ahead, settings.max_steps
+        if steps is not None or limit is not None:
+            goal_task = TaskVariant(goal_task, steps=steps, max_steps=limit)
+        self.environment = TaskEnvironment(self._make_environment(), goal_task)
         self._branches: Environment | None = None
         self._estimator = estimator_for(self.card) if settings.estimates else None
 
@@ -81,12 +77,7 @@ class EpisodePlayer:
             RecipeError: the row is not available here, or cannot be planned.
         """
         controller = self.controller(row)
-        return play(self.environment, self.spec(seed), controller), controller
-
-    def spec(self, seed: int) -> EpisodeSpec:
-        """The spec of a seed's episode."""
-        options = {"size": self.card.frame_size}
-        return EpisodeSpec(self.card.name, SPLIT, seed, options=options)
+        return play(self.environment, spec_of_seed(self.card, seed), controller), controller
 
     def controller(self, row: str) -> Controller:
         """The controller of a row."""
@@ -97,7 +88,7 @@ class EpisodePlayer:
             return RandomController(getattr(planner, "action_block", planner.actions_per_plan))
         if row in ("policy", "solution"):
             return ScriptedController(solves=row == "solution")
-        rollouts = self.rollouts() if row == "model" else self._simulated(row == "codec")
+        rollouts = self.rollouts() if row == "model" else self._simulator_rollouts(row == "codec")
         return PlanningController(planner, rollouts, make_cost(self.settings), usual=self._usual)
 
     def rollouts(self) -> ModelRollouts:
@@ -105,19 +96,19 @@ class EpisodePlayer:
         return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
 
     def write_video(
-        self, folder: Path, row: str, seed: int, played: EpisodeResult, controller: Controller
+        self, folder: Path, row: str, seed: int, result: EpisodeResult, controller: Controller
     ) -> None:
         """Write a video of what happened and, if the model planned, of what it imagined."""
-        expected = None
+        imagined = None
         if isinstance(controller, PlanningController) and isinstance(
             controller.rollouts, ModelRollouts
         ):
-            expected = imagined(played, controller.rollouts, controller.still)
+            imagined = imagine(result, controller.rollouts, controller.still)
         stride, task, fps = self._world.codec.temporal_stride, self.environment.task, self.card.fps
-        reader = estimator_for(self.card) if expected is not None else None
-        record = episode_curves(row, seed, played, task, fps, expected, reader, stride)
-        clip = None if expected is None else expected.clip
-        write_episode(folder / f"{row}-{seed:04d}.mp4", played, record, clip)
+        estimator = estimator_for(self.card) if imagined is not None else None
+        curves = draw_curves(row, seed, result, task, fps, imagined, estimator, stride)
+        clip = None if imagined is None else imagined.clip
+        write_episode(folder / f"{row}-{seed:04d}.mp4", result, curves, clip)
 
     def close(self) -> None:
         """Close the environments."""
@@ -125,33 +116,33 @@ class EpisodePlayer:
             if each is not None:
                 each.close()
 
-    def _simulated(self, coded: bool) -> SimulatorRollouts:
+    def _simulator_rollouts(self, coded: bool) -> SimulatorRollouts:
         if self._branches is None:
-            self._branches = self._environment()
+            self._branches = self._make_environment()
         codec = self._world.codec
         estimator = self._estimator if coded else None
         return SimulatorRollouts(self._branches, codec.temporal_stride, codec, estimator)
 
-    def _environment(self) -> Environment:
+    def _make_environment(self) -> Environment:
         return make_environment(self.card.name, {"size": self.card.frame_size})
 
 
 def make_planner(settings: Settings) -> Planner:
     """Create the planner of these settings."""
-    return _made("planner", settings.planner, Planner)
+    return _create("planner", settings.planner, Planner)
 
 
 def make_cost(settings: Settings) -> Cost:
     """Create the cost of these settings."""
-    return _made("cost", settings.cost, Cost)
+    return _create("cost", settings.cost, Cost)
 
 
-def _made(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
+def _create(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
     params = {name: value for name, value in choice.items() if name != "name"}
     return catalog().component(kind, choice["name"]).create_as(base, **params)
 
 
-def declared_by(run: str | Path, task: str) -> tuple[str, ...]:
+def declared_settings(run: str | Path, task: str) -> tuple[str, ...]:
     """The settings that a task of a run's environment declares; see `Task.planning`.
 
     Raises:
@@ -159,8 +150,7 @@ def declared_by(run: str | Path, task: str) -> tuple[str, ...]:
         DataError: the run has no readable card.
     """
     name = DatasetCard.read(RunFolder(find_run(run)).card).environment.name
-    found: Task = catalog().component("environment", name).load_task(task)
-    return found.planning
+    return catalog().component("environment", name).load_task(task).planning
 
 
 def usual_actions(run: Path) -> list[float] | None:
@@ -206,34 +196,38 @@ def plan_episodes(
     """
     weights = RunFolder(run).weights
     player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))
-    asked, digest = player.environment.task, read_metadata(weights).get("sha256")
+    goal_task, digest = player.environment.task, read_metadata(weights).get("sha256")
     identity = {"environment": player.card.name, "task": task, "weights": digest}
     # reports recognise the weights by the file's hash
-    facts = {"unit": asked.unit, "tolerance": asked.tolerance, "file_sha256": file_sha256(weights)}
+    facts = {
+        "unit": goal_task.unit,
+        "tolerance": goal_task.tolerance,
+        "file_sha256": file_sha256(weights),
+    }
     results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
     try:
         with results.adding():
-            for row, seed in left(rows, seeds, results.finished()):
+            for row, seed in missing_episodes(rows, seeds, results.finished()):
                 if row in unsolved:
                     continue
                 try:
-                    played, controller = player.play(row, seed)
+                    result, controller = player.play(row, seed)
                 except NoSolutionError:
                     unsolved.add(row)
                     continue
                 if seed in seeds[:videos]:
-                    player.write_video(out / VIDEOS, row, seed, played, controller)
-                line = {"row": row, "seed": seed, **played.facts()}
+                    player.write_video(out / VIDEOS, row, seed, result, controller)
+                line = {"row": row, "seed": seed, **result.facts()}
                 results.add(line)
-                _show(results, facts)
+                _write_table(results, facts)
                 report(line)
-            return _show(results, {**facts, "left_out": sorted(unsolved)})
+            return _write_table(results, {**facts, "left_out": sorted(unsolved)})
     finally:
         player.close()
 
 
-def _show(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
+def _write_table(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
     """Write the table and the page of the results so far; `facts` are added to the table's file."""
     table = summarise(results.finished())
     about = results.settings

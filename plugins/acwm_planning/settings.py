@@ -11,7 +11,7 @@ from acwm_core.recipe.check import check_component
 from acwm_core.recipe.compose import parse_override
 from acwm_core.recipe.types import checked
 
-ROWS = ("model", "simulator", "codec", "solution", "policy", "random", "still")
+ROW_NAMES = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 """What chooses the actions: the planner with the model; the same planner with the true simulator;
 the same again, but seen through codec and estimator; the task's scripted solution; the behaviour
 policy; random actions; no motion."""
@@ -72,18 +72,18 @@ class Settings:
         """The parameters of `ModelRollouts`."""
         return {"past": self.past, "steps": self.steps, "batch": self.batch}
 
-    def rows(self, asked: Collection[str]) -> list[str]:
-        """The rows to play of those that are asked for, in the order of `ROWS`.
+    def rows(self, names: Collection[str]) -> list[str]:
+        """The rows to play of those that are asked for, in the order of `ROW_NAMES`.
 
         A cost on latents is the same through the codec, so then there is no such row.
 
         Raises:
             RecipeError: there is no such row.
         """
-        for row in asked:
-            if row not in ROWS:
-                raise RecipeError(f"unknown row {row!r}{suggest(row, ROWS)}")
-        return [row for row in ROWS if row in asked and (row != "codec" or self.estimates)]
+        for row in names:
+            if row not in ROW_NAMES:
+                raise RecipeError(f"unknown row {row!r}{suggest(row, ROW_NAMES)}")
+        return [row for row in ROW_NAMES if row in names and (row != "codec" or self.estimates)]
 
     def to_dict(self) -> dict[str, Any]:
         """The settings that affect results, ready for JSON; the batch size does not."""
@@ -125,5 +125,5 @@ def settings_of(
                     components[name] |= value
                 elif value != components[name].get("name"):
                     components[name] = {"name": value}
-    made = {name: check_component(name, choice) for name, choice in components.items()}
-    return Settings(**made, **plain)
+    checked_choices = {name: check_component(name, choice) for name, choice in components.items()}
+    return Settings(**checked_choices, **plain)

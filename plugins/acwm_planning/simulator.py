@@ -11,12 +11,13 @@ from torch import Tensor
 
 from acwm_core.env.environment import Environment
 from acwm_core.env.physics import Observation, StateEstimator
-from acwm_core.env.task import Frame, Goal, Task, observed
-from acwm_core.errors import RecipeError, check_shape
+from acwm_core.env.task import Frame, observed
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Actions, Latent, Video
-from acwm_planning.futures import History, still_latent, tensor_of
-from acwm_planning.planner import Cost, Futures, RolloutCost
+from acwm_planning.futures import GoalCost, History, still_latent
+from acwm_planning.planner import Futures, RolloutCost
 
 
 class SimulatorFutures(Futures):
@@ -49,26 +50,20 @@ class SimulatorFutures(Futures):
         self._actions = actions.detach().cpu().numpy()
         self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
         self.length = len(self._ends)
-        self._seen: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
+        self._snapshots: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
         self._return: Callable[[], None] | None = None
 
     def latents(self, frames: Sequence[int]) -> Latent:
-        """See `Futures.latents`.
-
-        Raises:
-            RecipeError: no codec was given.
-        """
-        pictures = self._simulated(frames)[0]
+        pictures = self._simulate(frames)[0]
         latents = torch.cat([self.still(picture) for picture in pictures])
         return latents.unflatten(0, (len(self._actions), -1)).squeeze(2)
 
     def video(self, frames: Sequence[int]) -> Video:
-        """See `Futures.video`."""
-        return tensor_of(self._simulated(frames)[0])[0].unflatten(0, (len(self._actions), -1))
+        pictures = as_clip(np.stack(self._simulate(frames)[0]))
+        return pictures.unflatten(0, (len(self._actions), -1))
 
     def observe(self, frames: Sequence[int]) -> Observation:
-        """See `Futures.observe`."""
-        pictures, seen = self._simulated(frames)
+        pictures, seen = self._simulate(frames)
         if self._estimator is None or self._codec is None:
             return seen
         latents = torch.cat([self.still(picture) for picture in pictures])
@@ -77,18 +72,17 @@ class SimulatorFutures(Futures):
         return self._estimator.read(shown.cpu())
 
     def still(self, picture: Frame) -> Latent:
-        """See `Futures.still`."""
         if self._codec is None:
             raise RecipeError("the simulator has no latents: take cost=state")
         return still_latent(self._codec, picture)
 
-    def _simulated(self, frames: Sequence[int]) -> tuple[list[Frame], Observation]:
+    def _simulate(self, frames: Sequence[int]) -> tuple[list[Frame], Observation]:
         chosen = tuple(frames)
-        if chosen not in self._seen:
+        if chosen not in self._snapshots:
             looks = [look for rows in self._actions for look in self._looks(rows, chosen)]
             infos = [info for _, info in looks]
-            self._seen[chosen] = [frame for frame, _ in looks], observed(infos)
-        return self._seen[chosen]
+            self._snapshots[chosen] = [frame for frame, _ in looks], observed(infos)
+        return self._snapshots[chosen]
 
     def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
         """Frame and info at each of these latent frames, in order."""
@@ -132,22 +126,14 @@ class SimulatorRollouts:
         self._estimator = estimator
 
     def cost(
-        self,
-        history: History,
-        still: NDArray[np.float32],
-        judge: Cost,
-        task: Task,
-        goal: Goal,
-        seed: int,
+        self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
     ) -> RolloutCost:
-        """See `ModelRollouts.cost`; `still` and `seed` are ignored here."""
+        """As `ModelRollouts.cost`; `still` and `seed` are ignored here."""
 
         def cost(actions: Actions) -> Tensor:
-            made = SimulatorFutures(
+            futures = SimulatorFutures(
                 self.environment, history, actions, self._stride, self._codec, self._estimator
             )
-            costs = judge(made, task, goal)
-            check_shape(judge, "__call__", costs, len(actions))
-            return costs
+            return goal_cost(futures, len(actions))
 
         return cost

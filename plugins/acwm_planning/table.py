@@ -13,16 +13,17 @@ from scipy.stats import binomtest
 
 from acwm_core.evaluation.statistics import CONFIDENCE, Estimate, with_interval
 from acwm_core.files import writing, written_whole
+from acwm_planning.jobs import PLAN_SUMMARY
 from acwm_planning.resumable import Line
-from acwm_planning.settings import ROWS
+from acwm_planning.settings import ROW_NAMES
 
-SUMMARY, VIDEOS = "summary.json", "videos"
-"""File and folder of a table, in addition to the files of `ResumableResults`."""
+VIDEOS = "videos"
+"""Folder of a table's videos, beside `PLAN_SUMMARY` and the files of `ResumableResults`."""
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
     """Write the table."""
-    path = folder / SUMMARY
+    path = folder / PLAN_SUMMARY
     with writing(path), written_whole(path) as partial:
         partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
     return path
@@ -47,32 +48,32 @@ class RowSummary:
 
 
 def summarise(lines: Sequence[Line]) -> list[RowSummary]:
-    """Summarise each row that has episodes, in the order of `ROWS`."""
-    by_row = {row: {n["seed"]: n for n in lines if n["row"] == row} for row in ROWS}
-    there = [row for row in ROWS if by_row[row]]
-    return [_row(row, by_row[row], by_row[there[0]]) for row in there]
+    """Summarise each row that has episodes, in the order of `ROW_NAMES`."""
+    by_row = {row: {n["seed"]: n for n in lines if n["row"] == row} for row in ROW_NAMES}
+    rows = [row for row in ROW_NAMES if by_row[row]]
+    return [_row(row, by_row[row], by_row[rows[0]]) for row in rows]
 
 
-def _row(row: str, lines: Mapping[int, Line], first: Mapping[int, Line]) -> RowSummary:
-    made = list(lines.values())
-    successes = sum(bool(line["success"]) for line in made)
-    interval = binomtest(successes, len(made)).proportion_ci(CONFIDENCE, "exact")
-    distances = np.array([line["distance"] for line in made], float)
+def _row(row: str, by_seed: Mapping[int, Line], first: Mapping[int, Line]) -> RowSummary:
+    lines = list(by_seed.values())
+    successes = sum(bool(line["success"]) for line in lines)
+    interval = binomtest(successes, len(lines)).proportion_ci(CONFIDENCE, "exact")
+    distances = np.array([line["distance"] for line in lines], float)
 
     def mean(name: str) -> float | None:
-        values = [line[name] for line in made if name in line]
+        values = [line[name] for line in lines if name in line]
         return float(np.mean(values)) if values else None
 
     return RowSummary(
         row=row,
-        seeds=sorted(lines),
-        episodes=len(made),
+        seeds=sorted(by_seed),
+        episodes=len(lines),
         successes=successes,
-        success=Estimate(successes / len(made), float(interval.low), float(interval.high)),
-        failures=sum(bool(line["failed"]) for line in made),
+        success=Estimate(successes / len(lines), float(interval.low), float(interval.high)),
+        failures=sum(bool(line["failed"]) for line in lines),
         distance=with_interval(float(distances.mean()), [distances]),
-        start_distance=float(np.mean([line["start_distance"] for line in made])),
-        p=None if lines is first else mcnemar(first, lines),
+        start_distance=float(np.mean([line["start_distance"] for line in lines])),
+        p=None if by_seed is first else mcnemar(first, by_seed),
         seconds_per_decision=mean("seconds_per_decision"),
         rollouts_per_decision=mean("rollouts_per_decision"),
     )
@@ -85,7 +86,7 @@ def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
     return float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
 
 
-def left(
+def missing_episodes(
     rows: Sequence[str], seeds: Sequence[int], done: Sequence[Line]
 ) -> Iterator[tuple[str, int]]:
     """Episodes still to be played, seed by seed, so that a partial table compares all rows."""

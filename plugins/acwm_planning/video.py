@@ -16,6 +16,7 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, judged
 from acwm_core.evaluation import videos
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.files import writing, written_whole
 from acwm_core.model.shapes import Clip
 from acwm_planning.episode import EpisodeResult
@@ -83,32 +84,30 @@ class EpisodeCurves:
     plans: list[PlannedDistances]
 
 
-def imagined(
-    played: EpisodeResult, rollouts: ModelRollouts, still: NDArray[np.float32]
-) -> Imagined:
+def imagine(result: EpisodeResult, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Imagined:
     """What the model predicted for the actions that were taken, and for those that were planned."""
-    history, decisions = played.history, played.decisions
-    first = torch.from_numpy(history.frames[0]).permute(2, 0, 1)[None].float() / 255
+    history, decisions = result.history, result.decisions
+    first = as_clip(history.frames[0][None])
     clips, plans = [first], list[tuple[int, Clip]]()
     ends = [*(each.frame for each in decisions[1:]), len(history.actions)]
     stride = rollouts.world_model.codec.temporal_stride
     for decision, end in zip(decisions, ends, strict=True):
         now = decision.frame
-        by_then = History(history.spec, history.frames[: now + 1], history.actions[:now])
-        clip = rollouts.imagined(by_then, still, decision.plan.actions, decision.seed)
+        past = History(history.spec, history.frames[: now + 1], history.actions[:now])
+        clip = rollouts.imagine(past, still, decision.plan.actions, decision.seed)
         clips.append(clip[: end - now])
         plans.append((now, clip[stride - 1 :: stride]))
     return Imagined(torch.cat(clips), plans)
 
 
-def episode_curves(
+def draw_curves(
     row: str,
     seed: int,
-    played: EpisodeResult,
+    result: EpisodeResult,
     task: Task,
     fps: int,
-    expected: Imagined | None = None,
-    reader: StateEstimator | None = None,
+    imagined: Imagined | None = None,
+    estimator: StateEstimator | None = None,
     stride: int = 1,
 ) -> EpisodeCurves:
     """The curves of a video.
@@ -116,52 +115,52 @@ def episode_curves(
     Args:
         row: who acted.
         seed: number of the episode.
-        played: the episode.
+        result: the episode.
         task: defines the distances.
         fps: frames per second of the video.
-        expected: predictions of the model, if a model planned.
-        reader: estimator that reads the predicted frames, if there is one.
+        imagined: predictions of the model, if a model planned.
+        estimator: estimator that reads the predicted frames, if there is one.
         stride: frames between two pictures of a plan.
     """
-    seen, plans = list[float | None](), list[PlannedDistances]()
+    distances, plans = list[float | None](), list[PlannedDistances]()
 
     def read(clip: Clip) -> list[float | None]:
-        assert reader is not None
-        return _rounded(judged(task, "distance", reader.read(clip), played.goal))
+        assert estimator is not None
+        return _rounded(judged(task, "distance", estimator.read(clip), result.goal))
 
-    if expected is not None and reader is not None:
-        seen = read(expected.clip)
-        for now, clip in expected.plans:
+    if imagined is not None and estimator is not None:
+        distances = read(imagined.clip)
+        for now, clip in imagined.plans:
             frames = [now + stride * (place + 1) for place in range(len(clip))]
             plans.append(PlannedDistances(frames, read(clip) if len(clip) else []))
     return EpisodeCurves(
         row=row,
         seed=seed,
-        success=played.success,
-        failed=played.failed,
+        success=result.success,
+        failed=result.failed,
         unit=task.unit,
         tolerance=task.tolerance,
         fps=fps,
-        panels=["happened", *(["imagined"] if expected is not None else []), "goal"],
-        distances=_rounded(played.distances),
-        imagined=seen,
+        panels=["happened", *(["imagined"] if imagined is not None else []), "goal"],
+        distances=_rounded(result.distances),
+        imagined=distances,
         plans=plans,
     )
 
 
 def write_episode(
-    path: Path, played: EpisodeResult, record: EpisodeCurves, expected: Clip | None
+    path: Path, result: EpisodeResult, curves: EpisodeCurves, imagined: Clip | None
 ) -> None:
     """Write an episode as MP4, panel by panel, and its curves as a JSON file next to it."""
-    happened = np.stack(played.history.frames)
-    goal = np.broadcast_to(played.goal.frame, happened.shape)
-    panels = [happened, *([videos.to_pixels(expected)] if expected is not None else []), goal]
+    happened = np.stack(result.history.frames)
+    goal = np.broadcast_to(result.goal.frame, happened.shape)
+    panels = [happened, *([videos.to_pixels(imagined)] if imagined is not None else []), goal]
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     times = videos.magnification(happened.shape[1], PANEL)
-    write_mp4(path, videos.join(panels), record.fps, times)
+    write_mp4(path, videos.join(panels), curves.fps, times)
     with writing(path), written_whole(path.with_suffix(".json")) as partial:
-        partial.write_text(json.dumps(asdict(record), allow_nan=False), encoding="utf-8")
+        partial.write_text(json.dumps(asdict(curves), allow_nan=False), encoding="utf-8")
 
 
 def _rounded(values: Iterable[float]) -> list[float | None]:

@@ -14,7 +14,7 @@ from acwm_core.evaluation.statistics import ClipScores
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import tabulate
 from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
-from acwm_experiment.table import SUMMARY, Experiment
+from acwm_experiment.table import RUN_SUMMARY, Experiment
 from acwm_report.run import described
 from acwm_report.scores import CAPTION, ScoreGrid, published_scores
 from acwm_report.seeds import difference_over_seeds, over_seeds
@@ -32,7 +32,7 @@ def evaluated_runs(folder: str | Path) -> list[Path]:
     """
     experiment = Experiment.read(folder)
     runs = [run for cell in experiment.cells for run in cell.runs]
-    found = dict.fromkeys(run for run in runs if (run / SUMMARY).is_file())
+    found = dict.fromkeys(run for run in runs if (run / RUN_SUMMARY).is_file())
     if not found and not any(plan.progress() for plan in experiment.plans):
         raise DataError(f"no run of {folder} is evaluated yet")
     return [*found]
@@ -63,7 +63,7 @@ class _ExperimentTables:
         self._runs = {
             (cell.row, cell.column): runs
             for cell in experiment.cells
-            if (runs := [run for run in dict.fromkeys(cell.runs) if (run / SUMMARY).is_file()])
+            if (runs := [run for run in dict.fromkeys(cell.runs) if (run / RUN_SUMMARY).is_file()])
         }
         if not self._runs:
             raise DataError(f"no run of the experiment {experiment.name} is evaluated yet")

@@ -9,7 +9,7 @@ from pathlib import Path
 from acwm_core.evaluation.results import Estimate
 from acwm_core.files import read_json
 from acwm_experiment.table import Experiment
-from acwm_planning.jobs import PLANS, SUMMARY, PlanningJob
+from acwm_planning.jobs import PLAN_SUMMARY, PLANS, PlanningJob
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import MISSING, PERCENT, Cell, Column, Row, Scale, Table
 
@@ -62,7 +62,7 @@ class PlanTable:
 
 def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
     """The plan tables made with these weights, by folder, in order of their tasks."""
-    files = result_files(run, f"{PLANS}/*/{SUMMARY}")
+    files = result_files(run, f"{PLANS}/*/{PLAN_SUMMARY}")
     found = {path.parent: read_json(path, PlanTable, "a table of plans") for path in files}
     return {path: each for path, each in found.items() if each.file_sha256 == weights}
 
@@ -110,7 +110,7 @@ def task_tables(experiment: Experiment | None) -> list[Table]:
 
 
 def _task_rows(plan: PlanningJob) -> list[Row]:
-    found = read_json(plan.folder / SUMMARY, PlanTable, "a table of plans")
+    found = read_json(plan.folder / PLAN_SUMMARY, PlanTable, "a table of plans")
     scale, group = distance_scale(found.unit), f"{plan.row} · {plan.task}"
     asked = [each for each in found.rows if each.row in plan.rows]
     return [replace(_row(each, scale, scale.unit), group=group) for each in asked]

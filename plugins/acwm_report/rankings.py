@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from acwm_core.files import read_json
-from acwm_planning.policies.ranking import FILE, FOLDER, Ranking
+from acwm_planning.policies.ranking import RANKING_FILE, RANKING_FOLDER, Ranking
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import PLAIN, Cell, Column, Row, Table
@@ -24,7 +24,7 @@ def rankings(run: EvaluatedRun) -> list[Ranking]:
 
 def rankings_of(run: Path, weights: str) -> list[Ranking]:
     """The rankings in a run folder made with weights of this SHA-256."""
-    files = result_files(run, f"{FOLDER}/*/{FILE}")
+    files = result_files(run, f"{RANKING_FOLDER}/*/{RANKING_FILE}")
     found = [read_json(path, Ranking, "a ranking of policies") for path in files]
     return [each for each in found if each.weights == weights]
 

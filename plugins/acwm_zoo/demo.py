@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from acwm_core.env.episode import Split
     from acwm_core.recipe import Recipe
 
-EPISODES: Mapping[Split, int] = {"train": 3200, "ind_test": 64, "ood_test": 64}
-FEW_EPISODES: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
+EPISODE_COUNTS: Mapping[Split, int] = {"train": 3200, "ind_test": 64, "ood_test": 64}
+QUICK_EPISODE_COUNTS: Mapping[Split, int] = {"train": 16, "ind_test": 4, "ood_test": 4}
 
 ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 """Settings of the evaluation that the shipped model takes from the demo."""
@@ -41,7 +41,7 @@ def demo(out: Path | None, quick: bool) -> None:
 
     write_report = catalog().component("command", "report").load()
     folder = out or Path("runs", "demo_quick" if quick else "demo")
-    episodes = FEW_EPISODES if quick else EPISODES
+    episodes = QUICK_EPISODE_COUNTS if quick else EPISODE_COUNTS
     data, run, shipped, report = (folder / n for n in ("data", "run", "shipped", "report.html"))
     recipe = compose("demo", [*(["+quick"] if quick else []), f"data.path={data}"])
     total, steps = sum(episodes.values()), recipe.trainer["max_steps"]

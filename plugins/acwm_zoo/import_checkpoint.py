@@ -37,13 +37,13 @@ def import_checkpoint(
 
     from acwm_zoo.importing import import_checkpoint as run_import
 
-    made = run_import(file, out, overrides, importer=importer)
-    recipe = made.recipe
+    imported = run_import(file, out, overrides, importer=importer)
+    recipe = imported.recipe
     click.echo(
-        f"{made.run} holds {recipe.model.name} with {recipe.conditioner.name}, "
-        f"{made.parameters / 1e6:.1f} M parameters after {made.step:,} steps, "
+        f"{imported.run} holds {recipe.model.name} with {recipe.conditioner.name}, "
+        f"{imported.parameters / 1e6:.1f} M parameters after {imported.step:,} steps, "
         f"on latents of {recipe.codec.name}"
     )
-    for note in made.notes:
+    for note in imported.notes:
         click.echo(f"  {note}")
-    click.echo(f"next: acwm evaluate {made.run}, with its dataset in {recipe.data['path']}")
+    click.echo(f"next: acwm evaluate {imported.run}, with its dataset in {recipe.data['path']}")

@@ -123,10 +123,10 @@ def _scores(summary: Summary) -> str:
     splits = summary.splits
     lines = [["", *(SPLITS.get(split, split) for split in splits)], ["---"] * (1 + len(splits))]
     for name, info in summary.metrics.items():
-        found = [each.scores.rows["model"].get(name) for each in splits.values()]
-        if any(each and each.value is not None for each in found):
+        scores = [each.scores.rows["model"].get(name) for each in splits.values()]
+        if any(each and each.value is not None for each in scores):
             title = f"{info.title or name}, {info.unit}" if info.unit else info.title or name
-            lines.append([title, *(_shown(each) for each in found)])
+            lines.append([title, *(_shown(each) for each in scores)])
     asked = [each.counterfactual for each in splits.values()]
     for name in dict.fromkeys(n for each in asked if each for n in each.rows["model"]):
         cells = (_shown(each.rows["model"].get(name)) if each else "" for each in asked)

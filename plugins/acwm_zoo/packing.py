@@ -20,13 +20,12 @@ from acwm_core.files import made_whole, writing
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights, training_of
 from acwm_zoo.model_card import model_card
+from acwm_zoo.shipped import MODEL_CARD
 
 MAX_BYTES = 8_000_000
 """Largest size of the weights of a trained model, in bytes."""
 
-CARD = "README.md"
-
-FILES = ("recipe.yaml", "card.yaml", "model.safetensors", "metrics.csv", CARD)
+FILES = ("recipe.yaml", "card.yaml", "model.safetensors", "metrics.csv", MODEL_CARD)
 FILES += (f"{FOLDER}/{SUMMARY}", f"{FOLDER}/{EPISODES}", "codec-*.safetensors")
 """All files of a trained model; nothing else is published, fetched or shipped.
 
@@ -64,12 +63,12 @@ def pack(
     facts = read_metadata(folder.weights)
     weights = cast(dict[str, torch.Tensor], cast(Any, load_file)(folder.weights))
     with writing(out), made_whole(out) as partial:
-        made = RunFolder(partial)
+        packed = RunFolder(partial)
         rounded = {name: value.bfloat16() for name, value in weights.items()}
         details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
         details |= training_of(folder)
-        save_weights(made.weights, rounded, facts["codec"], facts["step"], **details)
-        size = made.weights.stat().st_size
+        save_weights(packed.weights, rounded, facts["codec"], facts["step"], **details)
+        size = packed.weights.stat().st_size
         if size > MAX_BYTES:  # checked before the evaluation, which takes long
             raise TrainingError(
                 f"the weights of {run} have {size / 1e6:.1f} MB, and at most "
@@ -77,13 +76,13 @@ def pack(
             )
         for part in ("card", "metrics"):
             if (file := cast(Path, getattr(folder, part))).exists():
-                shutil.copyfile(file, getattr(made, part))
-        made.recipe.write_text(_own(recipe, made.path).to_yaml(), encoding="utf-8")
+                shutil.copyfile(file, getattr(packed, part))
+        packed.recipe.write_text(_portable_recipe(recipe, packed.path).to_yaml(), encoding="utf-8")
         evaluate_run(partial, data=data or recipe.data["path"], overrides=overrides)
         summary = replace(Summary.read(partial), videos=[])  # videos are not packed
         summary.write(partial / FOLDER)
-        card = model_card(made, summary, name or out.name)
-        (partial / CARD).write_text(card, encoding="utf-8")
+        card = model_card(packed, summary, name or out.name)
+        (partial / MODEL_CARD).write_text(card, encoding="utf-8")
         strip(partial)
     return out
 
@@ -98,7 +97,7 @@ def strip(folder: Path) -> None:
             path.rmdir()
 
 
-def _own(recipe: Recipe, out: Path) -> Recipe:
+def _portable_recipe(recipe: Recipe, out: Path) -> Recipe:
     """The recipe without this machine's paths and threads; the codec's files are copied to `out`.
 
     Raises:

@@ -8,7 +8,7 @@ import yaml
 from acwm_core.errors import RecipeError
 from acwm_experiment.grid import read_grid
 from acwm_experiment.plan import make_plan
-from acwm_experiment.table import FILE
+from acwm_experiment.table import EXPERIMENT_FILE
 from tests.experiment.parts import write_experiment
 
 GRID = ("model.width=4,6", "training.learning_rate=1e-2,2e-2")
@@ -73,7 +73,7 @@ def test_every_combination_is_trained_and_resumed(acwm, whole, tmp_path):
     recipes = [yaml.safe_load(path.read_text()) for path in folder.glob("runs/*/recipe.yaml")]
     found = {(r["model"]["width"], r["training"]["learning_rate"]) for r in recipes}
     assert found == {(4, 0.01), (4, 0.02), (6, 0.01), (6, 0.02)}
-    rows = json.loads((folder / FILE).read_text())["rows"]
+    rows = json.loads((folder / EXPERIMENT_FILE).read_text())["rows"]
     assert rows[0] == "width=4, learning_rate=1e-2"
     assert len(rows) == 4
     code, out, _ = acwm("experiment", "tiny.yaml", "--grid", *GRID, cwd=tmp_path)

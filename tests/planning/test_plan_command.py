@@ -11,7 +11,7 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_planning.page import write_page
-from acwm_planning.settings import ROWS, settings_of
+from acwm_planning.settings import ROW_NAMES, settings_of
 from tests.planning import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
@@ -39,15 +39,17 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert code == 0, err
     folder = mine / "planning" / "place"
     made = lines(folder)
-    assert {(each["row"], each["seed"]) for each in made} == {(r, s) for r in ROWS for s in (0, 1)}
+    assert {(each["row"], each["seed"]) for each in made} == {
+        (r, s) for r in ROW_NAMES for s in (0, 1)
+    }
     summary = json.loads((folder / "summary.json").read_text())
-    assert [row["row"] for row in summary["rows"]] == list(ROWS)
+    assert [row["row"] for row in summary["rows"]] == list(ROW_NAMES)
     assert summary["planner"]["candidates"] == 6
     page = (folder / "index.html").read_text()
-    assert all(f'src="videos/{row}-0000.mp4"' in page for row in ROWS)
+    assert all(f'src="videos/{row}-0000.mp4"' in page for row in ROW_NAMES)
     assert "<td>still\n<td>0/2" in page
     videos = sorted(path.name for path in (folder / "videos").iterdir())
-    assert videos == sorted(f"{row}-0000.{kind}" for row in ROWS for kind in ("mp4", "json"))
+    assert videos == sorted(f"{row}-0000.{kind}" for row in ROW_NAMES for kind in ("mp4", "json"))
     assert summary["unit"] == "px"
     weights = hashlib.sha256((mine / "model.safetensors").read_bytes()).hexdigest()
     assert summary["file_sha256"] == weights
@@ -62,7 +64,7 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     code, _, err = acwm(capsys, *words, "--seeds", "0..2")
     assert code == 0, err
     assert lines(folder)[: len(made)] == made  # nothing is played twice
-    assert len(lines(folder)) == len(made) + len(ROWS)
+    assert len(lines(folder)) == len(made) + len(ROW_NAMES)
 
     code, _, err = acwm(capsys, *words, "past=1")
     assert (code, "holds results of another past" in err) == (2, True)
@@ -126,7 +128,7 @@ def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys
     code, out, err = acwm(capsys, *words, "--compare")
     assert code == 0, err
     rows = {each["row"] for each in lines(mine / "planning/place")}
-    assert rows == set(ROWS) - {"simulator", "codec"}
+    assert rows == set(ROW_NAMES) - {"simulator", "codec"}
     assert "no row of the simulator" in out
     code, _, err = acwm(capsys, *words, "--row", "simulator")
     assert (code, "needs a cost that is differentiable" in err) == (2, True)

@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import beta
 
 from acwm_core.errors import DataError
-from acwm_planning.resumable import EPISODES, ResumableResults
-from acwm_planning.table import left, mcnemar, summarise
+from acwm_planning.resumable import EPISODES_FILE, ResumableResults
+from acwm_planning.table import mcnemar, missing_episodes, summarise
 
 
 def line(row, seed, success, **facts):
@@ -59,15 +59,19 @@ def test_rows_stand_in_their_order_beside_the_first():
 def test_finished_episodes_are_kept_and_the_cut_off_one_is_played_again(tmp_path):
     results = ResumableResults(tmp_path / "out", {"task": "place", "steps": (1, 2)})
     results.add(line("model", 0, True))
-    with (results.folder / EPISODES).open("a") as file:
+    with (results.folder / EPISODES_FILE).open("a") as file:
         file.write('{"row": "model", "see')
     again = ResumableResults(tmp_path / "out", {"task": "place", "steps": (1, 2)})
     assert [each["seed"] for each in again.finished()] == [0]
     rows = ("model", "still")
-    assert [*left(rows, (0, 1), again.finished())] == [("still", 0), ("model", 1), ("still", 1)]
+    assert [*missing_episodes(rows, (0, 1), again.finished())] == [
+        ("still", 0),
+        ("model", 1),
+        ("still", 1),
+    ]
     again.add(line("still", 0, False))
     again.add(line("model", 1, False))
-    assert [*left(rows, (0, 1), again.finished())] == [("still", 1)]
+    assert [*missing_episodes(rows, (0, 1), again.finished())] == [("still", 1)]
 
 
 def test_results_of_other_settings_are_not_mixed(tmp_path):

@@ -10,8 +10,8 @@ import torch
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError
 from acwm_core.training.run import load_run
+from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
-from acwm_planning.policies.stages import ModelStage, SimulatorStage
 from tests.planning import tiny
 from tests.policies import slide
 
@@ -96,8 +96,8 @@ def module(tmp_path, monkeypatch):
 def stages(exact):
     bundle = load_run(exact)
     reader = tiny.SquareEstimator(bundle.card)
-    simulator = SimulatorStage(tiny.environment(), 1, slide.STRIDE, reader)
-    return simulator, ModelStage(bundle.world_model, reader, tiny.PLACE)
+    simulator = SimulatorJudge(tiny.environment(), 1, slide.STRIDE, reader)
+    return simulator, ModelJudge(bundle.world_model, reader, tiny.PLACE)
 
 
 def own(module, name):
@@ -111,7 +111,7 @@ def test_a_policy_decides_once_per_latent_frame_on_what_it_sees_there(module, st
     start = simulator.start(tiny.spec(2))
     policy = own(module, "right")
     seen = importlib.import_module(module).seen
-    played = simulator.performed(start, policy, 12)
+    played = simulator.play_own(start, policy, 12)
     shown, seen[:] = list(seen), []
     wanted = [start.frames[-1], played.frames[3], played.frames[7]]
     assert len(shown) == 3
@@ -174,8 +174,8 @@ def test_what_a_policy_writes_in_changes_nothing(name, module, stages):
     simulator, _ = stages
     start = simulator.start(tiny.spec(2))
     shown = [each.copy() for each in (start.frames, start.goal.frame, start.goal.state["position"])]
-    usual = simulator.performed(start, own(module, "right"), 12)
-    played = simulator.performed(start, own(module, name), 12)
+    usual = simulator.play_own(start, own(module, "right"), 12)
+    played = simulator.play_own(start, own(module, name), 12)
     assert all(map(np.array_equal, played.frames, usual.frames))
     now = (start.frames, start.goal.frame, start.goal.state["position"])
     assert all(map(np.array_equal, now, shown))

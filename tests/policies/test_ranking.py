@@ -8,10 +8,10 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.files import read_json
 from acwm_core.training.run import load_run
 from acwm_planning.policies.commands import print_ranking
-from acwm_planning.policies.ranking import FILE, Ranking
+from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
+from acwm_planning.policies.ranking import RANKING_FILE, Ranking
 from acwm_planning.policies.run import Ranker, rank_policies
-from acwm_planning.policies.scripted import ScriptedPolicy, declared
-from acwm_planning.policies.stages import ModelStage, SimulatorStage
+from acwm_planning.policies.scripted import ScriptedPolicy, built_in_policies
 from acwm_planning.policies.table import summarise
 from acwm_planning.resumable import ResumableResults
 from tests.planning import tiny
@@ -22,12 +22,12 @@ SEEDS = range(6)
 
 def simulator(given=1):
     reader = tiny.SquareEstimator(tiny.Slide.card)
-    return SimulatorStage(tiny.environment(), given, slide.STRIDE, reader)
+    return SimulatorJudge(tiny.environment(), given, slide.STRIDE, reader)
 
 
 def ranked(tmp_path, model, policies=None, seeds=SEEDS):
     reader = tiny.SquareEstimator(tiny.Slide.card)
-    policies = declared(True) if policies is None else policies
+    policies = built_in_policies(True) if policies is None else policies
     ranker = Ranker(simulator(), model, reader, policies, ScriptedPolicy("solution"))
     about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
     results = ResumableResults(tmp_path, about, ("policy", "seed"))
@@ -57,7 +57,7 @@ def test_the_simulator_in_the_place_of_the_model_is_right(tmp_path):
 def test_an_exact_model_ranks_as_well_as_its_estimator_reads(tmp_path, exact):
     bundle = load_run(exact)
     reader = tiny.SquareEstimator(bundle.card)
-    found = ranked(tmp_path, ModelStage(bundle.world_model, reader, tiny.PLACE, batch=7))
+    found = ranked(tmp_path, ModelJudge(bundle.world_model, reader, tiny.PLACE, batch=7))
     for judge in ("model", "estimator"):
         returns, choice = found.agreement[judge]["returns"], found.decisions[judge]
         assert returns.spearman.value > 0.97
@@ -69,7 +69,7 @@ def test_an_exact_model_ranks_as_well_as_its_estimator_reads(tmp_path, exact):
 def test_a_model_that_ignores_actions_chooses_no_better_than_chance(tmp_path, blind):
     bundle = load_run(blind)
     reader = tiny.SquareEstimator(bundle.card)
-    model = ModelStage(bundle.world_model, reader, tiny.PLACE, batch=7)
+    model = ModelJudge(bundle.world_model, reader, tiny.PLACE, batch=7)
     found = ranked(tmp_path, model)
     choice = found.decisions["model"]
     assert choice.regret.value == pytest.approx(choice.chance.value)
@@ -83,7 +83,7 @@ def test_a_model_sees_the_actions_that_were_taken(exact):
     """Against the simulator, episode by episode: to the pixel that the estimator reads."""
     bundle = load_run(exact)
     reader, stage = tiny.SquareEstimator(bundle.card), simulator()
-    model = ModelStage(bundle.world_model, reader, tiny.PLACE)
+    model = ModelJudge(bundle.world_model, reader, tiny.PLACE)
     for seed in range(4):
         start = stage.start(tiny.spec(seed))
         rows = [np.random.default_rng(seed).uniform(-2, 2, (12, 2)).astype(np.float32)]
@@ -102,8 +102,8 @@ def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
     assert (start.frames == start.frames[0]).all()
     assert start.actions.shape == (4, 2)
     rows = [np.full((12, 2), 1.5, np.float32), np.full((12, 2), -1.0, np.float32)]
-    made = ModelStage(bundle.world_model, reader, tiny.PLACE).replay(start, rows)
-    single = ModelStage(load_run(slide.make_run(tmp_path / "one")).world_model, reader, tiny.PLACE)
+    made = ModelJudge(bundle.world_model, reader, tiny.PLACE).replay(start, rows)
+    single = ModelJudge(load_run(slide.make_run(tmp_path / "one")).world_model, reader, tiny.PLACE)
     assert made == single.replay(simulator().start(tiny.spec(1)), rows)
 
 
@@ -125,7 +125,7 @@ def test_results_are_kept_and_gone_on_with(tmp_path, exact, monkeypatch):
     assert calls == [(0, 1), (1, 4)]  # what was there is not done again
     assert sorted(map(str, found.policies)) == sorted(map(str, whole.policies))
     assert found.decisions == whole.decisions
-    assert read_json(out / FILE, Ranking, "a ranking") == found
+    assert read_json(out / RANKING_FILE, Ranking, "a ranking") == found
     assert found.weights == file_sha256(exact / "model.safetensors")
 
 
@@ -169,7 +169,7 @@ def test_an_estimator_that_reads_nothing_is_an_error_and_no_ranking(tmp_path, ex
     bundle = load_run(exact)
     reader = Blind(bundle.card)
     policies = [ScriptedPolicy("solution"), ScriptedPolicy("behaviour")]
-    model = ModelStage(bundle.world_model, reader, tiny.PLACE)
+    model = ModelJudge(bundle.world_model, reader, tiny.PLACE)
     ranker = Ranker(simulator(), model, reader, policies, policies[0])
     about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
     results = ResumableResults(tmp_path, about, ("policy", "seed"))
@@ -184,7 +184,7 @@ def test_an_estimator_that_reads_nothing_is_an_error_and_no_ranking(tmp_path, ex
 def test_episodes_of_which_nothing_is_read_are_counted(tmp_path, exact, capsys):
     """Of a model whose pictures show nothing: the estimator reads the true ones."""
     bundle = load_run(exact)
-    model = ModelStage(bundle.world_model, Blind(bundle.card), tiny.PLACE)
+    model = ModelJudge(bundle.world_model, Blind(bundle.card), tiny.PLACE)
     policies = [ScriptedPolicy("solution"), ScriptedPolicy("behaviour")]
     found = ranked(tmp_path, model, policies, seeds=range(2))
     assert [each.unread for each in found.policies] == [{"model": 2}] * 2

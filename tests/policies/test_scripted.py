@@ -1,4 +1,4 @@
-"""Scripted policies: what they do to a script, and which are declared."""
+"""Scripted policies: what they do to a script, and which are built in."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,13 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import TaskEnvironment
 from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
-from acwm_planning.policies.scripted import HOLD, ScriptedPolicy, declared, scripted, solvable
+from acwm_planning.policies.scripted import (
+    HOLD,
+    ScriptedPolicy,
+    built_in_policies,
+    is_solvable,
+    parse_policy,
+)
 from tests.planning import tiny
 
 STEPS = 12
@@ -29,10 +35,10 @@ def actions(policy, seed=0):
 
 @pytest.mark.parametrize("solved", [True, False])
 def test_at_least_twenty_are_declared_and_no_two_are_alike(solved):
-    policies = declared(solved)
+    policies = built_in_policies(solved)
     names = [policy.name for policy in policies]
     assert len({*names}) == len(names) >= 20
-    assert [scripted(name) for name in names] == policies
+    assert [parse_policy(name) for name in names] == policies
     assert solved == any(policy.script == "solution" for policy in policies)
     rows = {np.stack([actions(each, seed) for seed in range(6)]).tobytes() for each in policies}
     assert len(rows) == len(policies)
@@ -61,7 +67,7 @@ def test_noise_is_held_and_a_bias_stays_for_all_episodes():
 
 def test_a_task_may_have_no_solution():
     shy = stage(task=tiny.SHY)
-    assert not solvable(shy.environment, shy.task, shy.goal)
+    assert not is_solvable(shy.environment, shy.task, shy.goal)
     with pytest.raises(RecipeError, match="'shy' has no scripted solution"):
         ScriptedPolicy("solution").begin(shy.environment, shy.task, shy.goal)
 
@@ -99,4 +105,4 @@ def test_a_script_that_is_kept_from_its_way_goes_on():
 )
 def test_names_that_are_none(text, message):
     with pytest.raises(RecipeError, match=message):
-        scripted(text)
+        parse_policy(text)

@@ -12,7 +12,7 @@ from acwm_core.cli import main
 from acwm_core.data.video import write_mp4
 from acwm_core.errors import AcwmWarning
 from acwm_core.evaluation.results import Summary, write_json
-from acwm_planning.policies.ranking import FILE
+from acwm_planning.policies.ranking import RANKING_FILE
 from acwm_planning.table import summarise
 from acwm_planning.video import EpisodeCurves
 from acwm_planning.video import PlannedDistances as Expected
@@ -125,7 +125,7 @@ def both(tmp_path):
     """A run that was ranked and planned with, and one that was not."""
     first = add_plans(make_run(tmp_path / "board" / "first", weights="1" * 64))
     (first / "ranking" / "place").mkdir(parents=True)
-    write_json(first / "ranking" / "place" / FILE, ranking("1" * 64))
+    write_json(first / "ranking" / "place" / RANKING_FILE, ranking("1" * 64))
     return first, make_run(tmp_path / "board" / "second", 1, weights="2" * 64)
 
 
@@ -153,7 +153,7 @@ def test_no_table_where_no_run_has_either(tmp_path):
 
 
 def test_a_damaged_ranking_takes_no_run_off_the_leaderboard(both):
-    (both[0] / "ranking" / "place" / FILE).write_text("[]")
+    (both[0] / "ranking" / "place" / RANKING_FILE).write_text("[]")
     _, found = write_leaderboard(both[0].parent)
     assert sorted(found.entries) == ["first", "second"]
     assert [*found.broken] == ["first: rankings and plans"]

@@ -7,7 +7,7 @@ import pytest
 
 from acwm_core.evaluation.results import Summary, write_json
 from acwm_core.evaluation.statistics import Estimate
-from acwm_planning.policies.ranking import FILE, Agreement, Decisions, PolicyScores, Ranking
+from acwm_planning.policies.ranking import RANKING_FILE, Agreement, Decisions, PolicyScores, Ranking
 from acwm_report.page import export_report, write_report
 
 
@@ -39,7 +39,7 @@ def mine(evaluated, tmp_path):
 
 def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     weights = Summary.read(mine).provenance["weights_sha256"]
-    write_json(mine / "ranking" / "place" / FILE, ranking(weights))
+    write_json(mine / "ranking" / "place" / RANKING_FILE, ranking(weights))
     text = write_report([mine]).read_text()
     assert "Whether it ranks policies" in text
     assert "&lt;place&gt; · 2 policies, 6 episodes of each" in text
@@ -65,7 +65,7 @@ def test_episodes_that_no_picture_tells_are_counted(mine, first, second, told):
     weights = Summary.read(mine).provenance["weights_sha256"]
     found = ranking(weights)
     policies = [replace(p, unread=n) for p, n in zip(found.policies, (first, second), strict=True)]
-    write_json(mine / "ranking" / "place" / FILE, replace(found, policies=policies))
+    write_json(mine / "ranking" / "place" / RANKING_FILE, replace(found, policies=policies))
     text = write_report([mine]).read_text()
     assert "Whether it ranks policies" in text
     assert ("The estimator read no distance" in text) == (told is not None)
@@ -74,5 +74,5 @@ def test_episodes_that_no_picture_tells_are_counted(mine, first, second, told):
 
 def test_one_of_other_weights_or_none_is_not(mine):
     assert "ranks policies" not in write_report([mine]).read_text()
-    write_json(mine / "ranking" / "place" / FILE, ranking("0" * 64))
+    write_json(mine / "ranking" / "place" / RANKING_FILE, ranking("0" * 64))
     assert "ranks policies" not in write_report([mine]).read_text()

@@ -76,24 +76,24 @@ def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESA
     """
     policies, episodes = truth.shape
     rng = np.random.default_rng(seed)
-    drawn: dict[str, list[float]] = {name: [] for name in STATISTICS}
+    samples: dict[str, list[float]] = {name: [] for name in STATISTICS}
     every, several = np.arange(episodes), episodes >= MIN_EPISODES
     for _ in range(resamples if policies >= MIN_EPISODES else 0):
         rows = rng.integers(policies, size=policies)
         columns = rng.integers(episodes, size=episodes) if several else every
         one, other = (each[rows][:, columns].mean(1) for each in (judge, truth))
         for name, statistic in STATISTICS.items():
-            drawn[name].append(statistic(one, other))
+            samples[name].append(statistic(one, other))
     values = {
-        name: _estimate(each(judge.mean(1), truth.mean(1)), np.array(drawn[name]))
+        name: _estimate(each(judge.mean(1), truth.mean(1)), np.array(samples[name]))
         for name, each in STATISTICS.items()
     }
     return Agreement(**values)
 
 
-def _estimate(value: float, drawn: Scores) -> Estimate:
-    kept = drawn[np.isfinite(drawn)]
-    if math.isnan(value) or not len(kept) or len(kept) < len(drawn) / 2:
+def _estimate(value: float, samples: Scores) -> Estimate:
+    kept = samples[np.isfinite(samples)]
+    if math.isnan(value) or not len(kept) or len(kept) < len(samples) / 2:
         return Estimate(defined(value))
     low, high = np.quantile(kept, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
@@ -113,9 +113,9 @@ def regret(judge: Scores, truth: Scores) -> tuple[float, float]:
 
 def decisions(judge: list[Scores], truth: list[Scores]) -> Decisions:
     """Regrets of choices at many starts, with intervals over the starts."""
-    lost = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
+    regrets = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
     means = [
         with_interval(float(each.mean()), [each])
-        for each in (lost[:, 0], lost[:, 1], lost[:, 1] - lost[:, 0])
+        for each in (regrets[:, 0], regrets[:, 1], regrets[:, 1] - regrets[:, 0])
     ]
-    return Decisions(len(lost), *means)
+    return Decisions(len(regrets), *means)

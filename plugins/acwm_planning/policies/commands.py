@@ -46,11 +46,11 @@ def rank(
     loop); scripted ones look at the simulator, so the model is given the actions they take there
     (open loop). Stopped at any point, the same command resumes.
     """
-    from acwm_planning.policies.scripted import scripted
+    from acwm_planning.policies.scripted import parse_policy
 
     for word in policies:  # reports misspelt names before the slow import of torch
         if word != "scripted" and ":" not in word:
-            scripted(word)
+            parse_policy(word)
 
     from acwm_planning.policies.run import rank_policies
 
@@ -91,18 +91,20 @@ def print_ranking(ranking: Ranking) -> None:
     for head in ("", "of", "Pearson", "Spearman", "Kendall", "MMRV", "optimism"):
         agreement.add_column(head, justify="left" if head in ("", "of") else "right")
     for judge, by_score in ranking.agreement.items():
-        for score, found in by_score.items():
-            values = found.pearson, found.spearman, found.kendall, found.mmrv, found.optimism
-            agreement.add_row(judge, score.replace("returns", "return"), *map(written, values))
+        for score, each in by_score.items():
+            values = each.pearson, each.spearman, each.kendall, each.mmrv, each.optimism
+            agreement.add_row(
+                judge, score.replace("returns", "return"), *map(format_estimate, values)
+            )
     console.print(agreement)
-    for judge, found in ranking.decisions.items():
+    for judge, decisions in ranking.decisions.items():
         console.print(
-            f"{judge}: choosing among action sequences loses {written(found.regret)} "
-            f"{ranking.unit} per action, at random {written(found.chance)}"
+            f"{judge}: choosing among action sequences loses {format_estimate(decisions.regret)} "
+            f"{ranking.unit} per action, at random {format_estimate(decisions.chance)}"
         )
 
 
-def written(estimate: Estimate) -> str:
+def format_estimate(estimate: Estimate) -> str:
     """Format an estimate, e.g. ``0.82 (0.61 to 0.93)``."""
     if estimate.value is None:
         return "–"

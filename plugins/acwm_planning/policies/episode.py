@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
-from acwm_core.env.task import Frame, Goal, Task
-from acwm_core.env.task import judged as told
+from acwm_core.env.task import Frame, Goal, Task, judged
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,9 @@ class Outcome:
         return dict(vars(self))
 
 
-def outcome(distances: NDArray[np.float64], success: NDArray[np.bool_], start: Start) -> Outcome:
+def compute_outcome(
+    distances: NDArray[np.float64], success: NDArray[np.bool_], start: Start
+) -> Outcome:
     """Compute the outcome of the T frames after the start.
 
     Args:
@@ -70,15 +71,15 @@ def outcome(distances: NDArray[np.float64], success: NDArray[np.bool_], start: S
     known = np.concatenate([[start.distance], distances])
     last = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(len(known)), 0))
     steps = int(success.argmax()) + 1 if success.any() else len(success)
-    told = known[last][1 : steps + 1]
+    counted = known[last][1 : steps + 1]
     unread = not np.isfinite(distances).any()
-    return Outcome(bool(success.any()), -float(told.sum()), steps, float(told[-1]), unread)
+    return Outcome(bool(success.any()), -float(counted.sum()), steps, float(counted[-1]), unread)
 
 
-def judged(seen: Observation, task: Task, start: Start) -> Outcome:
+def read_outcome(seen: Observation, task: Task, start: Start) -> Outcome:
     """Compute the outcome of T frames that an estimator has read."""
-    distances, success = (told(task, each, seen, start.goal) for each in ("distance", "success"))
-    return outcome(distances.astype(np.float64), success, start)
+    distances, success = (judged(task, each, seen, start.goal) for each in ("distance", "success"))
+    return compute_outcome(distances.astype(np.float64), success, start)
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class PolicyEpisode:
     outcome: Outcome
 
 
-def joined(parts: list[Observation]) -> Observation:
+def join_observations(parts: list[Observation]) -> Observation:
     """Concatenate observations in time."""
     states: Mapping[str, NDArray[Any]] = {
         name: np.concatenate([part.states[name] for part in parts]) for name in parts[0].states

@@ -40,13 +40,13 @@ class OwnPolicy:
 
     def __init__(self, name: str, card: EnvironmentCard) -> None:
         self.name, self._card = name, card
-        made = import_named(name, f"the policy {name}")
-        if isinstance(made, type):
-            made = self._asked("made", made)
-        if not (callable(getattr(made, "predict", None)) or callable(made)):
+        policy = import_named(name, f"the policy {name}")
+        if isinstance(policy, type):
+            policy = self._call("made", policy)
+        if not (callable(getattr(policy, "predict", None)) or callable(policy)):
             raise RecipeError(f"the policy {name} is not callable and has no predict()")
-        self._policy: Any = made.eval() if isinstance(made, torch.nn.Module) else made
-        self.observes = getattr(made, "observes", "frame")
+        self._policy: Any = policy.eval() if isinstance(policy, torch.nn.Module) else policy
+        self.observes = getattr(policy, "observes", "frame")
         if self.observes not in ("frame", "state"):
             raise RecipeError(f"the policy {name} observes {self.observes!r}: frame or state")
 
@@ -54,7 +54,7 @@ class OwnPolicy:
         """Start an episode."""
         reset = getattr(self._policy, "reset", None)
         if callable(reset):
-            self._asked("reset", reset, copy.deepcopy(goal))  # the policy may modify it
+            self._call("reset", reset, copy.deepcopy(goal))  # the policy may modify it
 
     def act(self, frame: Frame, state: Mapping[str, NDArray[Any]] | None) -> NDArray[np.float32]:
         """Choose the next action `[A]`, clipped to its bounds.
@@ -69,22 +69,22 @@ class OwnPolicy:
         if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
             picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
             with torch.no_grad():
-                made = self._asked("called", self._policy, picture)
-            made = made[0].cpu().numpy() if isinstance(made, torch.Tensor) else made
+                answer = self._call("called", self._policy, picture)
+            answer = answer[0].cpu().numpy() if isinstance(answer, torch.Tensor) else answer
         else:
             act = getattr(self._policy, "predict", self._policy)
-            made = self._asked("called", act, frame if self.observes == "frame" else state)
-            made = made[0] if isinstance(made, tuple) else made
+            answer = self._call("called", act, frame if self.observes == "frame" else state)
+            answer = answer[0] if isinstance(answer, tuple) else answer
         spec = self._card.action
-        action = np.asarray(made)
+        action = np.asarray(answer)
         if action.shape != (spec.size,) or not is_finite(action):
             raise RecipeError(
-                f"the policy {self.name} returned an array of shape {np.shape(made)}, but "
+                f"the policy {self.name} returned an array of shape {np.shape(answer)}, but "
                 f"{self._card.name} needs {spec.size} finite numbers"
             )
         return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
 
-    def _asked(self, doing: str, function: Any, *arguments: Any) -> Any:
+    def _call(self, doing: str, function: Any, *arguments: Any) -> Any:
         with noting(f"when the policy {self.name} was {doing}", self.name):
             return function(*arguments)
 

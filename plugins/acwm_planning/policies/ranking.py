@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from acwm_core.evaluation.statistics import Estimate
 
-FOLDER, FILE = "ranking", "ranking.json"
+RANKING_FOLDER, RANKING_FILE = "ranking", "ranking.json"
 """The result of a task is stored in ``RUN/ranking/TASK/ranking.json``."""
 
 

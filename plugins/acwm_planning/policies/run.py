@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
-from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.interventions import plan_branches
 from acwm_core.evaluation.results import write_json
@@ -23,19 +23,22 @@ from acwm_core.executors import progress_bar
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunFolder, load_run
 from acwm_core.training.trained import find_run
-from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, judged
+from acwm_planning.episode import spec_of_seed
+from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, read_outcome
+from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
-from acwm_planning.policies.ranking import FILE, Ranking
-from acwm_planning.policies.scripted import ScriptedPolicy, declared, scripted, solvable
-from acwm_planning.policies.stages import ModelStage, SimulatorStage, Stage, as_video
+from acwm_planning.policies.ranking import RANKING_FILE, Ranking
+from acwm_planning.policies.scripted import (
+    ScriptedPolicy,
+    built_in_policies,
+    is_solvable,
+    parse_policy,
+)
 from acwm_planning.policies.table import DECISION, summarise
 from acwm_planning.resumable import Line, ResumableResults
 
-SPLIT = "ind_test"
-"""Split of the episodes, on which no model was trained; a seed is an episode's number in it."""
-
 SCRIPTED = "scripted"
-"""Stands for all declared scripted policies."""
+"""Stands for all built-in scripted policies."""
 
 BRANCHES = ("another", "still", "reversed", "mirrored")
 """Alternatives to a start's own actions in a decision; see `plan_branches`."""
@@ -54,52 +57,48 @@ class Ranker:
 
     def __init__(
         self,
-        simulator: SimulatorStage,
-        model: Stage,
+        simulator: SimulatorJudge,
+        model: Judge,
         estimator: StateEstimator,
         policies: Sequence[ScriptedPolicy | OwnPolicy],
         script: ScriptedPolicy,
     ) -> None:
         self.policies, self._script = list(policies), script
         self._simulator, self._model, self._estimator = simulator, model, estimator
-        self._stage = simulator.environment
-        self._steps = self._stage.task.max_steps
+        self._environment = simulator.environment
+        self._steps = self._environment.task.max_steps
 
     def names(self) -> list[str]:
         """Names of everything that is rolled out from a start: the policies, and the decision."""
         return [*(policy.name for policy in self.policies), DECISION]
 
-    def lines(self, seed: int, wanted: Sequence[str]) -> list[Line]:
+    def lines(self, seed: int, names: Sequence[str]) -> list[Line]:
         """Results for some of `names`, from the start of a seed."""
-        start = self._simulator.start(self._spec(seed))
-        chosen = [policy for policy in self.policies if policy.name in wanted]
+        start = self._simulator.start(spec_of_seed(self._environment.environment.card, seed))
+        chosen = [policy for policy in self.policies if policy.name in names]
         open_loop = [policy for policy in chosen if isinstance(policy, ScriptedPolicy)]
-        played = [self._played(start, policy) for policy in open_loop]
-        branches = self._branches(start, seed) if DECISION in wanted else []
-        rows = [each.actions for each in played] + [rows for _, rows in branches]
-        imagined = self._model.replay(start, rows) if rows else []
-        made: list[Line] = []
-        for policy, true, seen in zip(open_loop, played, imagined, strict=False):
-            made.append(self._line(policy.name, seed, "open", start, true, seen))
+        episodes = [self._play(start, policy) for policy in open_loop]
+        branches = self._branches(start, seed) if DECISION in names else []
+        rows = [each.actions for each in episodes] + [rows for _, rows in branches]
+        outcomes = self._model.replay(start, rows) if rows else []
+        lines: list[Line] = []
+        for policy, true, seen in zip(open_loop, episodes, outcomes, strict=False):
+            lines.append(self._line(policy.name, seed, "open", start, true, seen))
         for policy in (each for each in chosen if isinstance(each, OwnPolicy)):
-            true = self._simulator.performed(start, policy, self._steps)
+            true = self._simulator.play_own(start, policy, self._steps)
             seen = self._model.perform(start, policy, self._steps)
-            made.append(self._line(policy.name, seed, "closed", start, true, seen))
+            lines.append(self._line(policy.name, seed, "closed", start, true, seen))
         if branches:
-            made.append(self._decision(start, seed, branches, imagined[len(played) :]))
-        return made
+            lines.append(self._decision(start, seed, branches, outcomes[len(episodes) :]))
+        return lines
 
-    def _spec(self, seed: int) -> EpisodeSpec:
-        card = self._stage.environment.card
-        return EpisodeSpec(card.name, SPLIT, seed, options={"size": card.frame_size})
-
-    def _played(self, start: Start, policy: ScriptedPolicy) -> PolicyEpisode:
-        task, goal = self._stage.task, start.goal
+    def _play(self, start: Start, policy: ScriptedPolicy) -> PolicyEpisode:
+        task, goal = self._environment.task, start.goal
         return self._simulator.play(start, lambda env: policy.begin(env, task, goal), self._steps)
 
     def _read(self, start: Start, true: PolicyEpisode) -> Outcome:
-        seen = self._estimator.read(as_video(np.stack(true.frames)))
-        return judged(seen, self._stage.task, start)
+        seen = self._estimator.read(as_clip(np.stack(true.frames)))
+        return read_outcome(seen, self._environment.task, start)
 
     def _line(
         self, name: str, seed: int, loop: str, start: Start, true: PolicyEpisode, seen: Outcome
@@ -109,13 +108,13 @@ class Ranker:
 
     def _branches(self, start: Start, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
         """The script's own actions and their alternatives, `[T, A]` each."""
-        other = self._simulator.start(self._spec(seed + 1))
-        rows = [self._played(each, self._script).actions for each in (other, start)]
+        other = self._simulator.start(spec_of_seed(self._environment.environment.card, seed + 1))
+        rows = [self._play(each, self._script).actions for each in (other, start)]
         self._simulator.start(start.spec, start.goal)
-        inner = self._stage.environment
+        inner = self._environment.environment
         another, own = (np.concatenate([each, np.zeros_like(each[:1])]) for each in rows)
-        made = plan_branches(own, another, inner.still_action(), inner.card.action)
-        kept = [(each.kind, each.actions[:-1]) for each in made if each.kind in BRANCHES]
+        alternatives = plan_branches(own, another, inner.still_action(), inner.card.action)
+        kept = [(each.kind, each.actions[:-1]) for each in alternatives if each.kind in BRANCHES]
         return [("own", own[:-1]), *kept]
 
     def _decision(
@@ -123,15 +122,15 @@ class Ranker:
         start: Start,
         seed: int,
         branches: Sequence[tuple[str, NDArray[np.float32]]],
-        imagined: Sequence[Outcome],
+        outcomes: Sequence[Outcome],
     ) -> Line:
-        found: list[dict[str, Any]] = []
-        for (kind, rows), seen in zip(branches, imagined, strict=True):
+        choices: list[dict[str, Any]] = []
+        for (kind, rows), seen in zip(branches, outcomes, strict=True):
             true = self._simulator.play(start, lambda _, r=rows: iter(r).__next__, len(rows))
             judges = {"truth": true.outcome, "estimator": self._read(start, true), "model": seen}
             each = {name: result.returns / self._steps for name, result in judges.items()}
-            found.append({"kind": kind, **each})
-        return {"policy": DECISION, "seed": seed, "branches": found}
+            choices.append({"kind": kind, **each})
+        return {"policy": DECISION, "seed": seed, "branches": choices}
 
 
 def rank_policies(
@@ -161,7 +160,7 @@ def rank_policies(
         AcwmError: the policies cannot be rolled out or ranked.
     """
     bundle, weights = load_run(run), file_sha256(RunFolder(find_run(run)).weights)
-    found: Task = catalog().component("environment", bundle.card.name).load_task(task)
+    goal_task: Task = catalog().component("environment", bundle.card.name).load_task(task)
     estimator = estimator_for(bundle.card)
     if estimator is None:
         raise DataError(
@@ -171,44 +170,44 @@ def rank_policies(
     world = bundle.world_model.to(choose_device(device))
     inner = make_environment(bundle.card.name, {"size": bundle.card.frame_size})
     try:
-        stage = TaskEnvironment(inner, found)
+        environment = TaskEnvironment(inner, goal_task)
         stride = world.codec.temporal_stride
-        simulator = SimulatorStage(stage, world.context_frames, stride, estimator)
-        first = EpisodeSpec(bundle.card.name, SPLIT, seeds[0], options={"size": inner.frame_size})
-        solved = solvable(inner, found, simulator.start(first).goal)
-        chosen = _chosen(policies, solved, found, bundle.card)
+        simulator = SimulatorJudge(environment, world.context_frames, stride, estimator)
+        start = simulator.start(spec_of_seed(bundle.card, seeds[0]))
+        solved = is_solvable(inner, goal_task, start.goal)
+        chosen = _parse_policies(policies, solved, goal_task, bundle.card)
         script = ScriptedPolicy("solution" if solved else "behaviour")
-        model = ModelStage(world, estimator, found, steps=steps)
+        model = ModelJudge(world, estimator, goal_task, steps=steps)
         ranker = Ranker(simulator, model, estimator, chosen, script)
-        identity = {"environment": bundle.card.name, "task": task, "unit": found.unit}
-        asked = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
-        results = ResumableResults(out, {**identity, **asked}, ("policy", "seed"))
+        identity = {"environment": bundle.card.name, "task": task, "unit": goal_task.unit}
+        settings = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
+        results = ResumableResults(out, {**identity, **settings}, ("policy", "seed"))
         with results.adding():
             _roll_out(ranker, results, seeds, progress)
             ranking = summarise(results)
-            write_json(out / FILE, ranking)
+            write_json(out / RANKING_FILE, ranking)
             return ranking
     finally:
         inner.close()
 
 
-def _chosen(
+def _parse_policies(
     words: Sequence[str], solved: bool, task: Task, card: Any
 ) -> list[ScriptedPolicy | OwnPolicy]:
-    made: dict[str, ScriptedPolicy | OwnPolicy] = {}
+    parsed: dict[str, ScriptedPolicy | OwnPolicy] = {}
     for word in words:
         if word == SCRIPTED:
-            made |= {policy.name: policy for policy in declared(solved)}
+            parsed |= {policy.name: policy for policy in built_in_policies(solved)}
         elif ":" in word:
-            made[word] = OwnPolicy(word, card)
+            parsed[word] = OwnPolicy(word, card)
         else:
-            policy = scripted(word)
+            policy = parse_policy(word)
             if policy.script == "solution" and not solved:
                 raise RecipeError(
                     f"the task {task.name!r} has no scripted solution: take behaviour"
                 )
-            made[policy.name] = policy
-    return [*made.values()]
+            parsed[policy.name] = policy
+    return [*parsed.values()]
 
 
 def _roll_out(

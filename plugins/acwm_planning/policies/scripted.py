@@ -30,7 +30,7 @@ class ScriptedPolicy:
     The action is ``s + skill · (a − s) + (noise · n + bias · b) · h``, clipped to the bounds. Here
     s is the action that means no motion, a the script's action, and h half the range of each
     dimension. In each dimension, n is uniform in [−1, 1] and held for `HOLD` actions, and b is 1 or
-    −1, drawn once per environment. A skill of 1 follows the script, 0 means no motion, and a
+    −1, samples once per environment. A skill of 1 follows the script, 0 means no motion, and a
     negative skill does the opposite.
 
     The script looks at the simulator, so its actions are computed there and then given to a model.
@@ -73,23 +73,23 @@ class ScriptedPolicy:
         script, rng = act, spec.rng(f"policy:{self.name}")
         low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
         side = EpisodeSpec(environment.card.name).rng("bias").choice([-1.0, 1.0], len(low))
-        drawn = (rng.uniform(-1, 1, len(low)) for _ in itertools.count())
-        noise = (each for each in drawn for _ in range(HOLD))
+        samples = (rng.uniform(-1, 1, len(low)) for _ in itertools.count())
+        noise = (each for each in samples for _ in range(HOLD))
 
         def disturbed() -> np.ndarray:
             still = environment.still_action()
-            wanted = np.asarray(script(), np.float64)
-            check_shape(owner, method, wanted, len(low))
-            if not np.isfinite(wanted).all():
+            intended = np.asarray(script(), np.float64)
+            check_shape(owner, method, intended, len(low))
+            if not np.isfinite(intended).all():
                 raise PluginError(f"{type(owner).__name__}.{method} gives numbers not finite")
             pushed = self.noise * next(noise) + self.bias * side
-            made = still + self.skill * (wanted - still) + pushed * (high - low) / 2
-            return np.clip(made.astype(np.float32), low, high)
+            raw = still + self.skill * (intended - still) + pushed * (high - low) / 2
+            return np.clip(raw.astype(np.float32), low, high)
 
         return disturbed
 
 
-def declared(solvable: bool) -> list[ScriptedPolicy]:
+def built_in_policies(solvable: bool) -> list[ScriptedPolicy]:
     """The policies that are ranked by default.
 
     Args:
@@ -108,7 +108,7 @@ def declared(solvable: bool) -> list[ScriptedPolicy]:
     ]
 
 
-def scripted(text: str) -> ScriptedPolicy:
+def parse_policy(text: str) -> ScriptedPolicy:
     """Parse a name such as ``solution,skill=0.7,noise=0.3,bias=0.15``.
 
     Raises:
@@ -130,7 +130,7 @@ def scripted(text: str) -> ScriptedPolicy:
     return ScriptedPolicy(cast(Script, script), **values)
 
 
-def solvable(environment: Environment, task: Task, goal: Goal) -> bool:
+def is_solvable(environment: Environment, task: Task, goal: Goal) -> bool:
     """Whether the task has a scripted solution from the environment's current state."""
     rng = environment.episode_spec.rng("policy")
     return task.solution(environment, goal, rng) is not None

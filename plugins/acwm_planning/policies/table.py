@@ -28,17 +28,17 @@ def summarise(results: ResumableResults) -> Ranking:
         DataError: they have no episode in common, or the estimator reads no distance for a policy.
     """
     lines, about = results.finished(), results.settings
-    played: dict[str, dict[int, Line]] = {}
+    by_policy: dict[str, dict[int, Line]] = {}
     for line in lines:
-        played.setdefault(line["policy"], {})[line["seed"]] = line
-    chosen = [line for _, line in sorted(played.pop(DECISION, {}).items())]
-    seeds = sorted(set[int].intersection(*map(set, played.values()))) if played else []
+        by_policy.setdefault(line["policy"], {})[line["seed"]] = line
+    chosen = [line for _, line in sorted(by_policy.pop(DECISION, {}).items())]
+    seeds = sorted(set[int].intersection(*map(set, by_policy.values()))) if by_policy else []
     if not seeds:
         raise DataError(
             f"the policies in {results.folder} have no episode in common: rank all of them on the "
             "same --seeds"
         )
-    unread = {name: _unread(of, seeds) for name, of in played.items()}
+    unread = {name: _unread(of, seeds) for name, of in by_policy.items()}
     blind = [name for name, counts in unread.items() if counts["estimator"] == len(seeds)]
     if blind:
         raise DataError(
@@ -47,9 +47,9 @@ def summarise(results: ResumableResults) -> Ranking:
             f"be ranked: improve the estimator, or leave these policies out and use another --out "
             f"than {results.folder}"
         )
-    judged = {
+    by_judge = {
         (judge, score): np.array(
-            [[float(of[n][judge][score]) for n in seeds] for of in played.values()]
+            [[float(of[n][judge][score]) for n in seeds] for of in by_policy.values()]
         )
         for judge in ("truth", *JUDGES)
         for score in SCORES
@@ -60,25 +60,25 @@ def summarise(results: ResumableResults) -> Ranking:
         unit=about["unit"],
         weights=about["weights"],
         episodes=len(seeds),
-        policies=_policies(played, seeds, judged, unread),
-        agreement={judge: _agreement(judge, judged) for judge in JUDGES},
+        policies=_policies(by_policy, seeds, by_judge, unread),
+        agreement={judge: _agreement(judge, by_judge) for judge in JUDGES},
         decisions={judge: decisions(*_choices(judge, chosen)) for judge in JUDGES if chosen},
     )
 
 
 def _policies(
-    played: Mapping[str, Mapping[int, Line]],
+    by_policy: Mapping[str, Mapping[int, Line]],
     seeds: Sequence[int],
-    judged: Mapping[tuple[str, str], Scores],
+    by_judge: Mapping[tuple[str, str], Scores],
     unread: Mapping[str, Mapping[str, int]],
 ) -> list[PolicyScores]:
     """Scores of the policies, best true score first."""
-    means = {which: values.mean(1) for which, values in judged.items()}
+    means = {which: values.mean(1) for which, values in by_judge.items()}
 
     def scores(score: str, row: int) -> dict[str, float]:
         return {judge: float(means[judge, score][row]) for judge in ("truth", *JUDGES)}
 
-    found = [
+    policies = [
         PolicyScores(
             name,
             of[seeds[0]]["loop"],
@@ -86,20 +86,20 @@ def _policies(
             scores("returns", row),
             {judge: count for judge, count in unread[name].items() if count},
         )
-        for row, (name, of) in enumerate(played.items())
+        for row, (name, of) in enumerate(by_policy.items())
     ]
-    return sorted(found, key=lambda each: (-each.success["truth"], -each.returns["truth"]))
+    return sorted(policies, key=lambda each: (-each.success["truth"], -each.returns["truth"]))
 
 
-def _unread(played: Mapping[int, Line], seeds: Sequence[int]) -> dict[str, int]:
+def _unread(lines: Mapping[int, Line], seeds: Sequence[int]) -> dict[str, int]:
     """For each judge, the number of episodes in which it could not read any distance."""
     return {
-        judge: sum(bool(played[seed][judge].get("unread")) for seed in seeds) for judge in JUDGES
+        judge: sum(bool(lines[seed][judge].get("unread")) for seed in seeds) for judge in JUDGES
     }
 
 
-def _agreement(judge: str, judged: Mapping[tuple[str, str], Scores]) -> dict[str, Agreement]:
-    return {score: agreement(judged[judge, score], judged["truth", score]) for score in SCORES}
+def _agreement(judge: str, by_judge: Mapping[tuple[str, str], Scores]) -> dict[str, Agreement]:
+    return {score: agreement(by_judge[judge, score], by_judge["truth", score]) for score in SCORES}
 
 
 def _choices(judge: str, chosen: Sequence[Line]) -> tuple[list[Any], list[Any]]:

@@ -14,13 +14,22 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task, TaskEnvironment
 from acwm_core.errors import noting
+from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
-from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, joined, judged, outcome
+from acwm_planning.policies.episode import (
+    Outcome,
+    PolicyEpisode,
+    Start,
+    compute_outcome,
+    join_observations,
+    read_outcome,
+)
 from acwm_planning.policies.own import OwnPolicy
 
 
-class Stage(ABC):
+class Judge(ABC):
     """Rolls out actions and policies, and judges the outcomes."""
 
     @abstractmethod
@@ -29,10 +38,10 @@ class Stage(ABC):
 
     @abstractmethod
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """Outcome of a policy that observes this stage, after `steps` actions."""
+        """Outcome of a policy that observes what this judge shows, after `steps` actions."""
 
 
-class SimulatorStage(Stage):
+class SimulatorJudge(Judge):
     """The true simulator.
 
     Args:
@@ -77,27 +86,25 @@ class SimulatorStage(Stage):
             return self._go_on(start, begin(self.environment.environment), steps)
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """See `Stage.replay`."""
         return [
             self.play(start, lambda _, rows=rows: iter(rows).__next__, len(rows)).outcome
             for rows in actions
         ]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """See `Stage.perform`."""
-        return self.performed(start, policy, steps).outcome
+        return self.play_own(start, policy, steps).outcome
 
-    def performed(self, start: Start, policy: OwnPolicy, steps: int) -> PolicyEpisode:
-        """The same as `perform`, with all frames and actions."""
+    def play_own(self, start: Start, policy: OwnPolicy, steps: int) -> PolicyEpisode:
+        """As `perform`, with all frames and actions."""
         self.start(start.spec, start.goal)
         self._frame = start.frames[-1]
         policy.reset(start.goal)
-        held: list[NDArray[np.float32]] = []
+        block: list[NDArray[np.float32]] = []
 
         def act() -> NDArray[np.float32]:
-            if not held:
-                held.extend([decision(policy, self._frame, self._estimator)] * self._stride)
-            return held.pop()
+            if not block:
+                block.extend([decision(policy, self._frame, self._estimator)] * self._stride)
+            return block.pop()
 
         return self._go_on(start, act, steps)
 
@@ -110,11 +117,11 @@ class SimulatorStage(Stage):
             frames.append(self._frame)
             distances.append(info["distance"])
             success.append(info["success"])
-        made = outcome(np.array(distances, np.float64), np.array(success), start)
-        return PolicyEpisode(frames, np.stack(actions), made)
+        outcome = compute_outcome(np.array(distances, np.float64), np.array(success), start)
+        return PolicyEpisode(frames, np.stack(actions), outcome)
 
 
-class ModelStage(Stage):
+class ModelJudge(Judge):
     """A world model whose frames an estimator reads.
 
     Args:
@@ -138,30 +145,33 @@ class ModelStage(Stage):
         self._steps, self._batch = steps, batch
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """See `Stage.replay`. All sequences get the same noise, so they differ only in actions."""
-        made: list[Outcome] = []
+        """All sequences get the same noise, so they differ only in actions."""
+        outcomes: list[Outcome] = []
         for first in range(0, len(actions), self._batch):
-            made += self._replayed(start, np.stack(actions[first : first + self._batch]))
-        return made
+            outcomes += self._replay_batch(start, np.stack(actions[first : first + self._batch]))
+        return outcomes
 
-    def _replayed(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:
+    def _replay_batch(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:
         number, known = len(rows), len(start.frames)
         last = np.zeros_like(rows[:, :1])  # no frame follows it
         between = np.broadcast_to(start.actions, (number, *start.actions.shape))
-        asked = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
+        inputs = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
         given = self._given(start).expand(number, -1, -1, -1, -1)
-        seeds, parts = [start.spec.index] * number, list[list[Observation]]()
+        seeds, observations = [start.spec.index] * number, list[list[Observation]]()
         with noting(_when(start), *self._world.children()):
-            chunks = self._world.rollout_chunks(given, asked, steps=self._steps, seeds=seeds)
+            chunks = self._world.rollout_chunks(given, inputs, steps=self._steps, seeds=seeds)
             for chunk in chunks:
                 new = chunk[:, max(0, known) :]
                 known = max(0, known - chunk.shape[1])
                 if new.shape[1]:
-                    parts.append([self._estimator.read(each.cpu()) for each in new])
-        return [judged(joined([*seen]), self._task, start) for seen in zip(*parts, strict=True)]
+                    observations.append([self._estimator.read(each.cpu()) for each in new])
+        return [
+            read_outcome(join_observations([*seen]), self._task, start)
+            for seen in zip(*observations, strict=True)
+        ]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """See `Stage.perform`. The policy decides once per latent frame.
+        """The policy decides once per latent frame.
 
         Raises:
             RecipeError: the model cannot be streamed.
@@ -171,24 +181,24 @@ class ModelStage(Stage):
             self._given(start), between, steps=self._steps, seeds=[start.spec.index]
         )
         policy.reset(start.goal)
-        frame, stride, parts = stream.given[0, -1], self._world.codec.temporal_stride, []
+        frame, stride, observations = stream.given[0, -1], self._world.codec.temporal_stride, []
         for _ in range(0, steps, stride):
-            action = decision(policy, pixels(frame), self._estimator)
+            action = decision(policy, to_pixels(frame[None])[0], self._estimator)
             rows = torch.from_numpy(np.stack([action] * stride))[None].to(self._device)
             with noting(_when(start), *self._world.children()):
                 frames = stream.step(rows)[0]
             frame = frames[-1]
-            parts.append(self._estimator.read(frames.cpu()))
-        seen = joined(parts)
+            observations.append(self._estimator.read(frames.cpu()))
+        seen = join_observations(observations)
         states = {name: values[:steps] for name, values in seen.states.items()}
-        return judged(Observation(seen.masks[:steps], states), self._task, start)
+        return read_outcome(Observation(seen.masks[:steps], states), self._task, start)
 
     @property
     def _device(self) -> torch.device:
         return self._world.action_low.device
 
     def _given(self, start: Start) -> Video:
-        return as_video(start.frames)[None].to(self._device)
+        return as_clip(start.frames)[None].to(self._device)
 
 
 def _when(start: Start) -> str:
@@ -201,16 +211,6 @@ def decision(
     """The action of a policy that observes a frame, or the states read from it."""
     state = None
     if policy.observes == "state" and estimator is not None:
-        seen = estimator.read(as_video(frame[None]))
+        seen = estimator.read(as_clip(frame[None]))
         state = {name: values[0] for name, values in seen.states.items()}
     return policy.act(frame.copy(), state)  # the policy may modify the frame
-
-
-def as_video(frames: NDArray[np.uint8]) -> torch.Tensor:
-    """Convert frames `[T, H, W, 3]` to `[T, 3, H, W]` in [0, 1]."""
-    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255
-
-
-def pixels(frame: torch.Tensor) -> Frame:
-    """Convert a frame `[3, H, W]` in [0, 1] to `[H, W, 3]` uint8."""
-    return (frame * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
