@@ -22,7 +22,7 @@ class ActionSource:
     """Gives the next action of whoever drives.
 
     Args:
-        tell: sends a message to the page, see `acwm_play.messages.Text`.
+        tell: sends a message to the page, see `acwm_play.messages.ServerMessage`.
 
     Attributes:
         driver: who drives: `PERSON`, `POLICY` or the registered name of a driver.
@@ -33,23 +33,23 @@ class ActionSource:
         self.driver, self.seq = PERSON, 0
         self._tell = tell
         self._task: str | None = None
-        self._attempt: GoalEpisode | None = None
+        self._episode: GoalEpisode | None = None
         self._values: list[float] | None = None
         self._places: NDArray[np.float64] | None = None
-        self._anew = True
+        self._restart_policy = True
 
     @property
     def over(self) -> bool:
         """Whether a driver has reached its goal, so that nothing happens until the page asks."""
-        return self._attempt is not None and self._attempt.solved
+        return self._episode is not None and self._episode.solved
 
-    def hold(self, wish: messages.Act | messages.Point) -> None:
+    def hold(self, message: messages.Act | messages.Point) -> None:
         """Note what the person wants, until the next message."""
-        self.seq = wish.seq
-        if isinstance(wish, messages.Act):
-            self._values, self._places = wish.values, None
+        self.seq = message.seq
+        if isinstance(message, messages.Act):
+            self._values, self._places = message.values, None
         else:
-            self._places = _places(wish.places)
+            self._places = _places(message.places)
 
     def hand_to(self, by: str, task: str | None = None) -> None:
         """Let someone else drive; nobody that is unknown."""
@@ -64,10 +64,10 @@ class ActionSource:
 
     def stop(self) -> None:
         """Forget what was wanted and planned."""
-        self._values, self._places, self._anew = None, None, True
-        if self._attempt is not None:
-            self._attempt.stop()
-            self._attempt = None
+        self._values, self._places, self._restart_policy = None, None, True
+        if self._episode is not None:
+            self._episode.stop()
+            self._episode = None
             self._tell("attempt", phase=None)
 
     async def ready(self, live: LiveWorld, wake: asyncio.Event) -> bool:
@@ -79,20 +79,20 @@ class ActionSource:
         self._choose(live)
         if self._task is None or self.driver in (PERSON, POLICY):
             return True
-        if self._attempt is None:
-            self._attempt = GoalEpisode(live, self.driver, self._task, self._tell)
+        if self._episode is None:
+            self._episode = GoalEpisode(live, self.driver, self._task, self._tell)
         try:
-            return await self._attempt.ready(wake)
+            return await self._episode.ready(wake)
         except Exception:
             self.hand_to(PERSON)
             raise
 
     async def act(self, live: LiveWorld) -> TimeStep:
         """Advance the simulator by one frame, after `ready`."""
-        if self._attempt is not None:
-            return await self._attempt.act()
+        if self._episode is not None:
+            return await self._episode.act()
         if self.driver == POLICY:
-            anew, self._anew = self._anew, False
+            anew, self._restart_policy = self._restart_policy, False
             return await live.act_by_policy(anew)
         pointing = live.simulator.pointing
         if self._places is not None and pointing is not None:

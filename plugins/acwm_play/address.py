@@ -1,6 +1,6 @@
 """The address of the page: a port, and a token that other programs and pages cannot guess.
 
-The token is kept in a file that only its user can read, so that an open page finds the server
+The token is stored in a file that only its user can read, so that an open page finds the server
 again after a restart.
 """
 
@@ -27,9 +27,9 @@ def token() -> str:
     with contextlib.suppress(OSError, UnicodeDecodeError):
         status = path.lstat()
         private = not status.st_mode & 0o077 and status.st_uid == os.getuid()
-        kept = path.read_text(encoding="ascii") if private and path.is_file() else ""
-        if re.fullmatch(r"[\w-]{40,80}", kept):
-            return kept
+        stored = path.read_text(encoding="ascii") if private and path.is_file() else ""
+        if re.fullmatch(r"[\w-]{40,80}", stored):
+            return stored
     fresh = secrets.token_urlsafe(32)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,19 +39,19 @@ def token() -> str:
     return fresh
 
 
-def listening(port: int | None) -> socket.socket:
+def open_socket(port: int | None) -> socket.socket:
     """Open a local socket on `port` (0 for any free port); by default `PORT`, else a free port.
 
     Raises:
         RecipeError: the port is taken.
     """
-    for wanted in [PORT, 0] if port is None else [port]:
-        made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    for candidate in [PORT, 0] if port is None else [port]:
+        server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            made.bind((HOST, wanted))
+            server.bind((HOST, candidate))
         except OSError:
-            made.close()
+            server.close()
         else:
-            return made
+            return server
     raise RecipeError(f"port {port} is taken: choose another --port, or leave it out")

@@ -6,12 +6,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import sentence
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.plugins import catalog
 from acwm_play.simulator import TimeStep
@@ -19,7 +19,7 @@ from acwm_play.simulator import TimeStep
 METRICS = ("position_error", "height_error", "mask_iou")
 """Metrics to measure, if they are installed and available for the world."""
 
-SEEN = 0.2
+MISSING_BELOW = 0.2
 """Share of its true area below which an object counts as missing, as in metric `permanence`."""
 
 MIN_PIXELS = 4
@@ -62,11 +62,11 @@ class Instruments:
         except Exception as error:  # whatever a plugin raises
             self.why_not = sentence(error)
         known = catalog().registry("metric")
-        made = {name: known[name].create_as(Metric) for name in METRICS if name in known}
+        metrics = {name: known[name].create_as(Metric) for name in METRICS if name in known}
         usable = self._estimator is not None
         self._metrics = {
             name: metric
-            for name, metric in made.items()
+            for name, metric in metrics.items()
             if usable and metric.unavailable(card, self._estimator) is None
         }
         self.about = {
@@ -74,14 +74,14 @@ class Instruments:
             for name, metric in self._metrics.items()
         }
 
-    def read(self, seen: NDArray[np.uint8], truth: TimeStep, floor: bool = False) -> Figures:
+    def measure(self, frame: NDArray[np.uint8], truth: TimeStep, floor: bool = False) -> Figures:
         """Compare a frame `[H, W, 3]` from the model with the simulator's truth."""
-        predicted = self._predicted(seen, truth)
-        floors = self._scores(self._predicted(truth.frame, truth)) if floor else {}
-        return Figures(self._scores(predicted), floors, self._missing(predicted))
+        prediction = self._prediction(frame, truth)
+        floors = self._scores(self._prediction(truth.frame, truth)) if floor else {}
+        return Figures(self._scores(prediction), floors, self._missing(prediction))
 
-    def _predicted(self, frame: NDArray[np.uint8], truth: TimeStep) -> Prediction:
-        pictures = torch.from_numpy(np.stack([frame, truth.frame])).permute(0, 3, 1, 2) / 255
+    def _prediction(self, frame: NDArray[np.uint8], truth: TimeStep) -> Prediction:
+        pictures = as_clip(np.stack([frame, truth.frame]))
         return Prediction(
             video=pictures[:1],
             target=pictures[1:],
@@ -103,14 +103,14 @@ class Instruments:
         missing: list[str] = []
         for name in self._estimator.physics.objects:
             number = self._card.instances.index(name)
-            shown = int((prediction.masks == number).sum())
-            found = int((prediction.observed.masks == number).sum())
-            if shown >= MIN_PIXELS and found < SEEN * shown:
+            area = int((prediction.masks == number).sum())
+            predicted_area = int((prediction.observed.masks == number).sum())
+            if area >= MIN_PIXELS and predicted_area < MISSING_BELOW * area:
                 missing.append(name)
         return missing
 
 
-def pixel_error(seen: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+def pixel_error(frame: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     """Root mean square difference of two frames, as a share of full scale."""
-    difference: Any = seen.astype(np.float32) - truth.astype(np.float32)
+    difference: Any = frame.astype(np.float32) - truth.astype(np.float32)
     return float(np.sqrt(np.mean(difference**2))) / 255

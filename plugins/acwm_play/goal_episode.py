@@ -37,7 +37,7 @@ class GoalEpisode:
         live: where it acts.
         driver: registered name of the driver.
         task: name of one of its tasks.
-        tell: sends a message to the page, see `acwm_play.messages.Text`.
+        tell: sends a message to the page, see `acwm_play.messages.ServerMessage`.
 
     Attributes:
         solved: whether the goal has been reached.
@@ -47,10 +47,10 @@ class GoalEpisode:
         self._live, self._name, self._task, self._tell = live, driver, task, tell
         self._driver: Driver | None = None
         self._plan: deque[Action] = deque()
-        self._thinking: asyncio.Task[None] | None = None
+        self._decision: asyncio.Task[None] | None = None
         self._stopped = threading.Event()
         self.solved = False
-        self._took: float | None = None
+        self._seconds: float | None = None
         self._decisions = 0
 
     async def ready(self, wake: asyncio.Event) -> bool:
@@ -61,16 +61,16 @@ class GoalEpisode:
         """
         if self.solved or self._plan:
             return True
-        thinking = self._thinking = self._thinking or self._begin_to_think()
+        decision = self._decision = self._decision or self._start_decision()
         wake.clear()
         waking = asyncio.create_task(wake.wait())
         try:
-            await asyncio.wait({thinking, waking}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({decision, waking}, return_when=asyncio.FIRST_COMPLETED)
         finally:
             waking.cancel()
-        if thinking.done() and not thinking.cancelled():
-            self._thinking = None
-            thinking.result()
+        if decision.done() and not decision.cancelled():
+            self._decision = None
+            decision.result()
         return False
 
     async def act(self) -> TimeStep:
@@ -85,36 +85,36 @@ class GoalEpisode:
     def stop(self) -> None:
         """Give up: a decision in progress ends with the driver's next look at its check."""
         self._stopped.set()
-        if self._thinking is not None:
-            self._thinking.cancel()
+        if self._decision is not None:
+            self._decision.cancel()
 
-    def _begin_to_think(self) -> asyncio.Task[None]:
-        thinking = asyncio.create_task(self._think())
+    def _start_decision(self) -> asyncio.Task[None]:
+        decision = asyncio.create_task(self._decide())
         # An error that comes just when it is stopped is nobody's.
-        thinking.add_done_callback(lambda done: done.cancelled() or done.exception())
-        return thinking
+        decision.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return decision
 
-    async def _think(self) -> None:
+    async def _decide(self) -> None:
         """Plan the next actions; at first, set the goal."""
         simulator, run = self._live.simulator, self._live.workers.run
         if self._driver is None:
-            self._say("starting")
+            self._tell_phase("starting")
             goal, progress = await simulator.aim(self._task)
-            self._tell("goal", **_shown(goal), task=self._task, **dataclasses.asdict(progress))
+            self._tell("goal", **_picture(goal), task=self._task, **dataclasses.asdict(progress))
             if progress.solved:
                 self._finish()
                 return
             still = await simulator.still()
-            self._driver = await run("driver", self._begun, goal, still)
-        self._say("planning")
+            self._driver = await run("driver", self._create_driver, goal, still)
+        self._tell_phase("planning")
         recent = [*self._live.recent]
-        frames, actions = [each.frame for each in recent], [each.action for each in recent[1:]]
-        decided, self._took = await run("driver", self._decided, self._driver, frames, actions)
-        self._plan.extend(decided)
+        frames, past = [each.frame for each in recent], [each.action for each in recent[1:]]
+        actions, self._seconds = await run("driver", self._ask_driver, self._driver, frames, past)
+        self._plan.extend(actions)
         self._decisions += 1
-        self._say("acting")
+        self._tell_phase("acting")
 
-    def _begun(self, goal: Goal, still: Action) -> Driver:
+    def _create_driver(self, goal: Goal, still: Action) -> Driver:
         live = self._live
         self._check()
         task, card = live.tasks[self._task], live.simulator.card
@@ -123,18 +123,18 @@ class GoalEpisode:
             driver.begin(goal, still, live.scene.index)
         return driver
 
-    def _decided(
+    def _ask_driver(
         self, driver: Driver, frames: Sequence[NDArray[np.uint8]], actions: Sequence[Action]
     ) -> tuple[NDArray[np.float32], float]:
         """The next actions `[n, A]`, and how many seconds the decision took."""
         self._check()
-        began = time.monotonic()
+        start = time.monotonic()
         with noting(f"while driver {self._name!r} acts", driver):
-            made = np.asarray(driver.act(frames, actions, self._check), np.float32)
-            check_shape(driver, "act", made, -1, self._live.simulator.card.action.size)
-            if not len(made):
+            planned = np.asarray(driver.act(frames, actions, self._check), np.float32)
+            check_shape(driver, "act", planned, -1, self._live.simulator.card.action.size)
+            if not len(planned):
                 raise PluginError(f"{type(driver).__name__}.act gives no action")
-        return made, time.monotonic() - began
+        return planned, time.monotonic() - start
 
     def _check(self) -> None:
         if self._stopped.is_set():
@@ -143,16 +143,16 @@ class GoalEpisode:
     def _finish(self) -> None:
         self.solved = True
         self._plan.clear()
-        self._say("solved")
+        self._tell_phase("solved")
 
-    def _say(self, phase: Phase) -> None:
+    def _tell_phase(self, phase: Phase) -> None:
         if self._stopped.is_set():
             return
-        facts: dict[str, Any] = {"took": self._took, "decisions": self._decisions}
+        facts: dict[str, Any] = {"took": self._seconds, "decisions": self._decisions}
         self._tell("attempt", phase=phase, task=self._task, **facts)
 
 
-def _shown(goal: Goal) -> dict[str, Any]:
+def _picture(goal: Goal) -> dict[str, Any]:
     """The picture of a goal: its size, and its pixels as text."""
     pixels = np.ascontiguousarray(goal.frame).tobytes()
     return {"size": goal.frame.shape[:2], "pixels": base64.b64encode(pixels).decode()}

@@ -63,11 +63,11 @@ def controls(card: EnvironmentCard, physics: Physics | None) -> list[dict[str, A
         else:
             order += [i for i in range(action.size) if i not in order][:1]
     order += [i for i in range(action.size) if i not in order]
-    described: list[dict[str, Any]] = []
+    descriptions: list[dict[str, Any]] = []
     for i, name in enumerate(action.names):
         place = order.index(i)
         setting = not action.units[i] and (action.low[i], action.high[i]) == (-1.0, 1.0)
-        described.append(
+        descriptions.append(
             {
                 "name": name,
                 "label": name.replace("_", " "),
@@ -80,26 +80,26 @@ def controls(card: EnvironmentCard, physics: Physics | None) -> list[dict[str, A
                 "place": place,
             }
         )
-    return described
+    return descriptions
 
 
 def _along(
-    card: EnvironmentCard, physics: Physics | None, axis: int, taken: list[int]
+    card: EnvironmentCard, physics: Physics | None, axis: int, order: list[int]
 ) -> tuple[int, int] | None:
     """The dimension that moves most along right (0) or up (1) in the picture, and its sign."""
     if physics is None or physics.camera is None:
         return None
-    best, found = 0.0, None
+    best, dimension = 0.0, None
     for i, name in enumerate(card.action.names):
         letters = re.findall(r"(?:^|_)d?([xyz])(?:_|$)", name)
-        if i in taken or len(letters) != 1:
+        if i in order or len(letters) != 1:
             continue
         step = 0.01 * np.array([np.zeros(3), AXES[letters[0]]])
         here, there = physics.camera.to_frame(step)[:, :2]
         way = float((there - here)[axis]) * (1, -1)[axis]  # y is down in pictures
         if abs(way) > 1.02 * best:
-            best, found = abs(way), (i, 1 if way > 0 else -1)
-    return found if best > 1e-4 else None
+            best, dimension = abs(way), (i, 1 if way > 0 else -1)
+    return dimension if best > 1e-4 else None
 
 
 class Pointing:
@@ -119,24 +119,24 @@ class Pointing:
         self._camera, self._aspect, self._maps = physics.camera, aspect, maps
 
     @classmethod
-    def found(cls, simulator: Simulator, physics: Physics | None) -> Pointing | None:
+    def fit(cls, simulator: Simulator, physics: Physics | None) -> Pointing | None:
         """Fit the map: for absolute actions, the simulator's `still_action` says where things are.
 
         It is compared with the positions of the bodies in a few scenes. None if the actions are not
         places in the plane.
         """
-        action, given = simulator.card.action, simulator.environment
+        action = simulator.card.action
         if action.kind != "absolute" or action.size % 2 or physics is None or not physics.camera:
             return None
-        stills: list[NDArray[np.float64]] = []
+        still_actions: list[NDArray[np.float64]] = []
         bodies: list[NDArray[np.float64]] = []
         for index in range(SAMPLES):
             time_step = simulator.start(Scene(index))[0]
-            stills.append(np.asarray(given.still_action(), np.float64))
+            still_actions.append(np.asarray(simulator.still(), np.float64))
             rows = [r.of(time_step.state) for r in physics.readings if r.kind == "position"]
             bodies.append(np.concatenate([r.reshape(-1, r.shape[-1])[:, :2] for r in rows]))
         maps = [
-            _fitted(np.stack(bodies, 1), np.stack(stills)[:, i : i + 2])
+            _fit_map(np.stack(bodies, 1), np.stack(still_actions)[:, i : i + 2])
             for i in range(0, action.size, 2)
         ]
         if any(each is None for each in maps):
@@ -146,16 +146,16 @@ class Pointing:
 
     def action(self, places: NDArray[np.float64]) -> NDArray[np.float32]:
         """The action `[2P]` for places; it may be out of its bounds."""
-        seen = (places - 0.5) * [self._aspect, 1.0]
-        ground = self._camera.on_plane(seen, 0.0)[:, :2]
+        offsets = (places - 0.5) * [self._aspect, 1.0]
+        ground = self._camera.on_plane(offsets, 0.0)[:, :2]
         rows = [_with_one(g) @ m for g, m in zip(ground, self._maps, strict=True)]
         return np.concatenate(rows).astype(np.float32)
 
     def places(self, action: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """The inverse of `action`."""
-        wanted = np.asarray(action, np.float64).reshape(-1, 2)
-        ground = np.zeros((len(wanted), 3))
-        for k, (row, each) in enumerate(zip(wanted, self._maps, strict=True)):
+        pairs = np.asarray(action, np.float64).reshape(-1, 2)
+        ground = np.zeros((len(pairs), 3))
+        for k, (row, each) in enumerate(zip(pairs, self._maps, strict=True)):
             ground[k, :2] = np.linalg.solve(each[:2].T, row - each[2])
         return self._camera.to_frame(ground)[:, :2] / [self._aspect, 1.0] + 0.5
 
@@ -164,11 +164,13 @@ def _with_one(point: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.append(point, 1.0)
 
 
-def _fitted(bodies: NDArray[np.float64], stills: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _fit_map(
+    bodies: NDArray[np.float64], still_actions: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
     """The affine map from that one of several bodies that explains two action dimensions."""
     for body in bodies:
         known = np.column_stack([body, np.ones(len(body))])
-        solved, _, rank, _ = np.linalg.lstsq(known, stills, rcond=None)
-        if rank == 3 and np.abs(known @ solved - stills).max() < TOLERANCE:
-            return np.asarray(solved, np.float64)
+        solution, _, rank, _ = np.linalg.lstsq(known, still_actions, rcond=None)
+        if rank == 3 and np.abs(known @ solution - still_actions).max() < TOLERANCE:
+            return np.asarray(solution, np.float64)
     return None

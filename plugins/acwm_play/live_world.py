@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from acwm_core.env.task import Task
 from acwm_core.plugins import catalog
 from acwm_play.about import about_world, places
-from acwm_play.dream import Dream
 from acwm_play.figures import Instruments
 from acwm_play.layout import controls, physics_of
+from acwm_play.live_model import LiveModel
 from acwm_play.process import SimulatorProcess
 from acwm_play.simulator import Scene, TimeStep
 from acwm_play.workers import Workers
@@ -33,7 +33,7 @@ class LiveWorld:
         world: the world that is played.
         workers: threads for model and instruments.
         simulator: the true simulator.
-        dream: the model.
+        model: the model.
         instruments: measure the model's frames.
         controls: description of the action's dimensions for the page.
         tasks: the world's tasks by name; empty if nobody drives towards goals.
@@ -45,7 +45,7 @@ class LiveWorld:
     world: World
     workers: Workers
     simulator: SimulatorProcess
-    dream: Dream
+    model: LiveModel
     instruments: Instruments
     controls: list[dict[str, Any]]
     tasks: dict[str, Task]
@@ -53,24 +53,24 @@ class LiveWorld:
     recent: deque[TimeStep]
 
     @classmethod
-    async def built(cls, world: World, workers: Workers) -> LiveWorld:
+    async def create(cls, world: World, workers: Workers) -> LiveWorld:
         """Load everything that a world needs.
 
         Raises:
             AcwmError: something cannot be loaded.
         """
-        simulator = await SimulatorProcess.started(world.environment, world.size)
+        simulator = await SimulatorProcess.launch(world.environment, world.size)
         card = simulator.card
         try:
-            dream = await workers.run("model", workers.dream, world, card)
+            model = await workers.run("model", workers.live_model, world, card)
             instruments = await workers.run("instruments", Instruments, card)
         except BaseException:
             await asyncio.shield(simulator.close())
             raise
-        described = controls(card, physics_of(world.environment))
+        layout = controls(card, physics_of(world.environment))
         tasks = tasks_of(world.environment) if catalog().registry("driver") else {}
-        parts = world, workers, simulator, dream, instruments, described, tasks
-        return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, dream.given)))
+        parts = world, workers, simulator, model, instruments, layout, tasks
+        return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, model.given)))
 
     async def begin(self, scene: Scene) -> tuple[TimeStep, NDArray[np.uint8]]:
         """Start a scene; returns the simulator's time step and the model's picture of it.
@@ -78,7 +78,7 @@ class LiveWorld:
         Raises:
             AcwmError: a factor does not have this value, or the simulator failed.
         """
-        time_steps = await self.simulator.start(scene, self.dream.given)
+        time_steps = await self.simulator.start(scene, self.model.given)
         self.recent.clear()
         self.recent.extend(time_steps)
         self.scene = scene
@@ -86,10 +86,10 @@ class LiveWorld:
 
     async def take_over(self) -> NDArray[np.uint8]:
         """Restart the model from the simulator's last frames; returns its picture of the last."""
-        given = [*self.recent][-self.dream.given :]
+        given = [*self.recent][-self.model.given :]
         frames = np.stack([time_step.frame for time_step in given])
         actions = [time_step.action for time_step in given][1:]
-        return await self.workers.run("model", self.dream.restart, frames, actions)
+        return await self.workers.run("model", self.model.restart, frames, actions)
 
     async def act(self, action: NDArray[np.float32]) -> TimeStep:
         """Advance the simulator by one frame."""
@@ -103,13 +103,13 @@ class LiveWorld:
 
     async def predict(self, actions: list[NDArray[np.float32]]) -> NDArray[np.uint8]:
         """The model's frames for the actions of one latent frame."""
-        return await self.workers.run("model", self.dream.step, actions)
+        return await self.workers.run("model", self.model.step, actions)
 
     def places(self, action: NDArray[Any]) -> list[list[float]] | None:
         """The places in the picture that an action points to."""
         return places(self.simulator.pointing, action)
 
-    async def resting(self) -> dict[str, Any]:
+    async def rest(self) -> dict[str, Any]:
         """The action that means no motion, and the places in the picture that it points to."""
         still = await self.simulator.still()
         return {"rest": still.tolist(), "places": self.places(still)}
@@ -122,12 +122,12 @@ class LiveWorld:
         """Describe the world and its scene for the page."""
         card, label = self.simulator.card, time_step.ood_label
         shared = about_world(
-            self.world.name, card, self.dream.stride, self.controls, self.simulator.pointing
+            self.world.name, card, self.model.stride, self.controls, self.simulator.pointing
         )
         return {
             **shared,
-            "drivers": _drivers() if self.tasks else [],
-            "tasks": [_about(name, task) for name, task in self.tasks.items()],
+            "drivers": _describe_drivers() if self.tasks else [],
+            "tasks": [_describe_task(name, task) for name, task in self.tasks.items()],
             "metrics": self.instruments.about,
             "why_not": self.instruments.why_not,
             "factors": [dataclasses.asdict(factor) for factor in card.factors],
@@ -138,10 +138,10 @@ class LiveWorld:
         }
 
 
-def _drivers() -> list[dict[str, str]]:
+def _describe_drivers() -> list[dict[str, str]]:
     return [{"name": each.name, "summary": each.summary} for each in catalog().registry("driver")]
 
 
-def _about(name: str, task: Task) -> dict[str, Any]:
+def _describe_task(name: str, task: Task) -> dict[str, Any]:
     facts = {"summary": task.summary, "unit": task.unit, "tolerance": float(task.tolerance)}
     return {"name": name, **facts}

@@ -1,8 +1,8 @@
 """The messages between page and server over the socket.
 
-The page sends JSON objects; ``type`` selects one of `WISHES`. The server also sends JSON, and
-frames as binary: the length of a JSON header as four bytes (little-endian), the header, the pixels
-of the simulator's frames, and then those of the model's frames.
+The page sends JSON objects; ``type`` selects one of `PAGE_MESSAGES`. The server also sends JSON,
+and frames as binary: the length of a JSON header as four bytes (little-endian), the header, the
+pixels of the simulator's frames, and then those of the model's frames.
 """
 
 from __future__ import annotations
@@ -92,18 +92,18 @@ class Record:
     on: bool
 
 
-Text = Literal["world", "state", "figures", "busy", "notice", "goal", "attempt"]
+ServerMessage = Literal["world", "state", "figures", "busy", "notice", "goal", "attempt"]
 """Types of the server's JSON messages."""
 
-Wish = Act | Point | Open | TakeOver | Pause | Step | Speed | Drive | Record
+PageMessage = Act | Point | Open | TakeOver | Pause | Step | Speed | Drive | Record
 
-WISHES: Mapping[str, type[Any]] = {
+PAGE_MESSAGES: Mapping[str, type[Any]] = {
     **{"act": Act, "point": Point, "open": Open, "take_over": TakeOver, "pause": Pause},
     **{"step": Step, "speed": Speed, "drive": Drive, "record": Record},
 }
 
 
-def parse(text: str) -> Wish:
+def parse(text: str) -> PageMessage:
     """Parse a message from the page.
 
     Raises:
@@ -111,11 +111,11 @@ def parse(text: str) -> Wish:
     """
     try:
         values = parse_json(text)
-        kind = WISHES[values.pop("type")]
-        wish: Wish = typed(values, kind)
+        kind = PAGE_MESSAGES[values.pop("type")]
+        message: PageMessage = typed(values, kind)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"the page sent an invalid message: {error}") from error
-    return wish
+    return message
 
 
 def pack(header: Mapping[str, Any], *frames: NDArray[np.uint8]) -> bytes:
@@ -138,7 +138,7 @@ class Outbox:
         self._frames: deque[bytes] = deque()
         self.dropped = 0
 
-    def put(self, kind: Text, /, **values: Any) -> None:
+    def put(self, kind: ServerMessage, /, **values: Any) -> None:
         """Add a text message, as the last; it replaces a waiting one of the same type."""
         self._texts.pop(kind, None)
         self._texts[kind] = {"type": kind, **values}

@@ -39,7 +39,7 @@ class WorldPool:
         Raises:
             AcwmError: the world cannot be played.
         """
-        self._spare = await LiveWorld.built(next(iter(self.worlds.values())), self.workers)
+        self._spare = await LiveWorld.create(next(iter(self.worlds.values())), self.workers)
 
     async def acquire(self, world: World) -> LiveWorld:
         """A running world, for one session.
@@ -51,13 +51,13 @@ class WorldPool:
         if spare is not None and spare.world == world and spare.simulator.alive:
             self._spare = None
             return spare
-        return await LiveWorld.built(world, self.workers)
+        return await LiveWorld.create(world, self.workers)
 
     async def release(self, live: LiveWorld) -> None:
         """Take back a world that a session has finished with."""
-        kept, self._spare = (live, None) if self._closed else (self._spare, live)
-        if kept is not None:
-            await kept.close()
+        surplus, self._spare = (live, None) if self._closed else (self._spare, live)
+        if surplus is not None:
+            await surplus.close()
 
     async def close(self) -> None:
         """Close everything that is not in use by a session."""

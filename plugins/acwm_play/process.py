@@ -23,7 +23,7 @@ PATIENCE = 5.0
 
 
 class SimulatorProcess:
-    """A `Simulator` in another process; create it with `started`.
+    """A `Simulator` in another process; create it with `launch`.
 
     Errors in that process are raised here as a `RecipeError` or a `PluginError`.
 
@@ -39,47 +39,47 @@ class SimulatorProcess:
     def __init__(self, environment: str, size: tuple[int, int]) -> None:
         self._name = environment
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
+        self._connection, other_end = context.Pipe()
         self._process = context.Process(
-            target=_simulate, args=(theirs, environment, size), daemon=True
+            target=_simulate, args=(other_end, environment, size), daemon=True
         )
         self._thread = ThreadPoolExecutor(1, f"acwm-play-{environment}")
-        self._theirs, self.alive = theirs, True
+        self._other_end, self.alive = other_end, True
 
     @classmethod
-    async def started(cls, environment: str, size: tuple[int, int]) -> SimulatorProcess:
+    async def launch(cls, environment: str, size: tuple[int, int]) -> SimulatorProcess:
         """Start the process and wait until it is ready.
 
         Raises:
             AcwmError: the environment cannot be created.
         """
-        made = cls(environment, size)
+        process = cls(environment, size)
         try:
-            made.card, made.pointing = await made._do(made._begin)
+            process.card, process.pointing = await process._do(process._begin)
         except BaseException:
-            await asyncio.shield(made.close())
+            await asyncio.shield(process.close())
             raise
-        return made
+        return process
 
     async def start(self, scene: Scene, frames: int) -> list[TimeStep]:
         """See `Simulator.start`."""
-        return await self._do(self._ask, "start", scene, frames)
+        return await self._do(self._request, "start", scene, frames)
 
     async def step(self, action: NDArray[np.float32]) -> TimeStep:
         """See `Simulator.step`."""
-        return await self._do(self._ask, "step", action)
+        return await self._do(self._request, "step", action)
 
     async def step_by_policy(self, anew: bool) -> TimeStep:
         """See `Simulator.step_by_policy`."""
-        return await self._do(self._ask, "step_by_policy", anew)
+        return await self._do(self._request, "step_by_policy", anew)
 
     async def aim(self, task: str) -> tuple[Goal, TaskProgress]:
         """See `Simulator.aim`."""
-        return await self._do(self._ask, "aim", task)
+        return await self._do(self._request, "aim", task)
 
     async def still(self) -> NDArray[np.float32]:
         """See `Simulator.still`."""
-        return await self._do(self._ask, "still")
+        return await self._do(self._request, "still")
 
     async def close(self) -> None:
         """End the process."""
@@ -94,27 +94,27 @@ class SimulatorProcess:
 
     def _begin(self) -> Any:
         self._process.start()
-        self._theirs.close()
-        return self._answer()
+        self._other_end.close()
+        return self._receive()
 
-    def _ask(self, name: str, *args: Any) -> Any:
+    def _request(self, name: str, *args: Any) -> Any:
         try:
             self._connection.send((name, args))
         except OSError as error:
-            raise self._gone() from error
-        return self._answer()
+            raise self._ended_error() from error
+        return self._receive()
 
-    def _answer(self) -> Any:
+    def _receive(self) -> Any:
         try:
             good, answer = self._connection.recv()
         except (EOFError, OSError) as error:
-            raise self._gone() from error
+            raise self._ended_error() from error
         if not good:
             kind, text = answer
             raise kind(text)
         return answer
 
-    def _gone(self) -> PluginError:
+    def _ended_error(self) -> PluginError:
         self.alive = False
         return PluginError(f"the simulator of {self._name} has ended: begin a new scene")
 
@@ -129,25 +129,25 @@ class SimulatorProcess:
 def _simulate(connection: Connection, environment: str, size: tuple[int, int]) -> None:
     """Main function of the process: answers requests until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the server, which ends this
-    made: list[Simulator] = []
+    simulators: list[Simulator] = []  # none if it cannot be created
 
     def begin() -> tuple[EnvironmentCard, Pointing | None]:
-        made.append(Simulator(environment, size))
-        return made[0].card, Pointing.found(made[0], physics_of(environment))
+        simulators.append(Simulator(environment, size))
+        return simulators[0].card, Pointing.fit(simulators[0], physics_of(environment))
 
     try:
-        connection.send(_answered(begin))
-        while made:
+        connection.send(_answer(begin))
+        while simulators:
             name, args = connection.recv()
-            connection.send(_answered(getattr(made[0], name), *args))
+            connection.send(_answer(getattr(simulators[0], name), *args))
     except (EOFError, OSError):  # the server has closed the connection, or died
         pass
     finally:
-        for simulator in made:
+        for simulator in simulators:
             simulator.close()
 
 
-def _answered(work: Any, *args: Any) -> tuple[bool, Any]:
+def _answer(work: Any, *args: Any) -> tuple[bool, Any]:
     """The result, or class and text of an error; some errors cannot be sent between processes."""
     try:
         return True, work(*args)

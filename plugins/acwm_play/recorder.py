@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.card import CARD, DatasetCard, package_versions
@@ -20,6 +18,7 @@ from acwm_core.env.card import check_episode
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import OtherDatasetError
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.videos import join, magnification, panels
 from acwm_core.files import held, writing
 from acwm_core.plugins import catalog
@@ -42,11 +41,11 @@ class Recording:
 
     Attributes:
         time_steps: the simulator's data of each frame.
-        dreamt: the model's frames, `[H, W, 3]` uint8 each.
+        model_frames: the model's frames, `[H, W, 3]` uint8 each.
     """
 
     time_steps: list[TimeStep] = field(default_factory=list[TimeStep])
-    dreamt: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
+    model_frames: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
 
     @property
     def frames(self) -> int:
@@ -59,11 +58,11 @@ class Recording:
         contacts = [
             (index, *pair) for index, each in enumerate(self.time_steps) for pair in each.contacts
         ]
-        taken = [time_step.action for time_step in self.time_steps]
+        actions = [time_step.action for time_step in self.time_steps]
         return Episode(
             spec=spec,
             video=np.stack([time_step.frame for time_step in self.time_steps]),
-            actions=np.stack([*taken[1:], np.zeros_like(taken[0])]),
+            actions=np.stack([*actions[1:], np.zeros_like(actions[0])]),
             states={name: np.stack([state[name] for state in states]) for name in states[0]},
             masks=np.stack([time_step.mask for time_step in self.time_steps]),
             contacts=np.array(contacts, np.int32).reshape(-1, 3),
@@ -89,19 +88,17 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
         with held(folder):
             index = _append(recording, card, folder)
     video = out / f"{folder.name}-{index:06d}.mp4"
-    true, dreamt = (
-        torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255
-        for frames in ([time_step.frame for time_step in recording.time_steps], recording.dreamt)
-    )
+    true = as_clip(np.stack([time_step.frame for time_step in recording.time_steps]))
+    predicted = as_clip(np.stack(recording.model_frames))
     with writing(video):
-        write_mp4(video, join(panels(true, dreamt)), card.fps, magnification(height))
+        write_mp4(video, join(panels(true, predicted)), card.fps, magnification(height))
     return folder, index, video
 
 
 def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
     """Write one shard per episode, so that existing shards do not change."""
     requires = catalog().component("environment", card.name).requires
-    wanted = DatasetCard(
+    new = DatasetCard(
         environment=replace(card, horizon=MAX_FRAMES),
         splits={"train": 1},
         seed=0,
@@ -111,24 +108,24 @@ def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
         versions=package_versions(requires),
         source={"kind": "play", "name": card.name, "notes": [NOTE]},
     )
-    there = DatasetCard.read(folder) if (folder / CARD).exists() else None
-    count = there.splits["train"] if there else 0
-    if there and (found := there.differences(replace(wanted, splits=there.splits))):
-        raise OtherDatasetError(folder, found)
+    existing = DatasetCard.read(folder) if (folder / CARD).exists() else None
+    count = existing.splits["train"] if existing else 0
+    if existing and (differences := existing.differences(replace(new, splits=existing.splits))):
+        raise OtherDatasetError(folder, differences)
     shards = folder / "train"
     shards.mkdir(exist_ok=True)
-    episode = recording.episode(wanted.spec("train", count))
-    check_episode(episode, wanted.environment)
-    record = write_shard(shards / shard_name(count), [episode], card.fps, wanted.versions)
+    episode = recording.episode(new.spec("train", count))
+    check_episode(episode, new.environment)
+    record = write_shard(shards / shard_name(count), [episode], card.fps, new.versions)
     manifest = Manifest(shards)
     manifest.add(record)
     manifest.finish()
-    made = dataclasses.replace(
-        wanted,
+    updated = replace(
+        new,
         splits={"train": count + 1},
         actions={"train": action_statistics(manifest.ordered())},
         checksums={"train": manifest.checksum()},
     )
-    made.write(folder)
-    write_readme(folder, made)
+    updated.write(folder)
+    write_readme(folder, updated)
     return count

@@ -14,7 +14,7 @@ import click
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from acwm_core.errors import DataError
-from acwm_play.address import HOST, listening, token
+from acwm_play.address import HOST, open_socket, token
 from acwm_play.messages import MAX_MESSAGE, parse
 from acwm_play.pool import WorldPool
 from acwm_play.session import Session
@@ -62,14 +62,14 @@ class Server:
 
     def application(self) -> web.Application:
         """The application for aiohttp."""
-        made = web.Application(middlewares=[self._guarded])
-        made.router.add_get("/{token}/socket", self._socket)
-        made.router.add_get("/{token}/{file:[a-z.]*}", self._file)
-        made.on_shutdown.append(self._shut)
-        return made
+        application = web.Application(middlewares=[self._guard])
+        application.router.add_get("/{token}/socket", self._socket)
+        application.router.add_get("/{token}/{file:[a-z.]*}", self._file)
+        application.on_shutdown.append(self._close_pages)
+        return application
 
     @web.middleware
-    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse wrong tokens, and wrong host names (which prevents DNS rebinding)."""
         host = request.host.rpartition(":")[0] or request.host
         given = request.match_info.get("token", "")
@@ -108,18 +108,18 @@ class Server:
             reason = f"{MAX_SESSIONS} pages are open already".encode()
             await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason)
             return socket
-        playing = self._sockets[socket] = asyncio.ensure_future(self._played(socket))
+        playing = self._sockets[socket] = asyncio.ensure_future(self._play(socket))
         try:
             await asyncio.shield(playing)
         finally:
             playing.add_done_callback(lambda _: self._sockets.pop(socket))
         return socket
 
-    async def _played(self, socket: web.WebSocketResponse) -> None:
+    async def _play(self, socket: web.WebSocketResponse) -> None:
         """Play until the page leaves, sends an invalid message, or something fails."""
         more = asyncio.Event()
         session = Session(self._pool, self._out, more)
-        parts = [_hear(socket, session), _speak(socket, session, more), session.run()]
+        parts = [_receive(socket, session), _send(socket, session, more), session.run()]
         tasks = [asyncio.ensure_future(part) for part in parts]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -135,7 +135,7 @@ class Server:
             await asyncio.gather(*tasks, return_exceptions=True)
             await socket.close()
 
-    async def _shut(self, _: web.Application) -> None:
+    async def _close_pages(self, _: web.Application) -> None:
         """Tell all pages that the server ends, and wait until their recordings are saved."""
         playing = dict(self._sockets)
         for socket in playing:
@@ -144,14 +144,14 @@ class Server:
             await asyncio.wait(playing.values(), timeout=SAVING)
 
 
-async def _hear(socket: web.WebSocketResponse, session: Session) -> None:
+async def _receive(socket: web.WebSocketResponse, session: Session) -> None:
     """Pass the page's messages to the session until the page leaves."""
     async for message in socket:
         if message.type is WSMsgType.TEXT:
-            session.wish(parse(message.data))
+            session.receive(parse(message.data))
 
 
-async def _speak(socket: web.WebSocketResponse, session: Session, more: asyncio.Event) -> None:
+async def _send(socket: web.WebSocketResponse, session: Session, more: asyncio.Event) -> None:
     """Send waiting messages. With a slow page this waits, and the outbox drops old frames."""
     while True:
         message = session.outbox.take()
@@ -184,7 +184,7 @@ def serve(
 
 
 async def _serve(pool: WorldPool, server: Server, port: int | None, browser: bool) -> None:
-    socket = listening(port)
+    socket = open_socket(port)
     runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=5)
     ended = asyncio.Event()
     with contextlib.suppress(NotImplementedError):

@@ -23,7 +23,7 @@ from acwm_play.action_source import PERSON, ActionSource
 from acwm_play.clock import SPEEDS, Clock
 from acwm_play.figures import pixel_error
 from acwm_play.live_world import LiveWorld
-from acwm_play.messages import Outbox, Wish, pack
+from acwm_play.messages import Outbox, PageMessage, pack
 from acwm_play.pool import WorldPool
 from acwm_play.recorder import MAX_FRAMES, Recording, save
 from acwm_play.simulator import Scene, TimeStep
@@ -47,15 +47,15 @@ class Session:
         self._clock = Clock(10)
         self._source = ActionSource(self._tell)
         self._live: LiveWorld | None = None
-        self._wanted: messages.Open | None = None
+        self._request: messages.Open | None = None
         self._take_over = False
         self._last: tuple[TimeStep, NDArray[np.uint8]] | None = None
         self._alone = 0
         self._recording: Recording | None = None
         self._keep_recording = False
         self._predicting: asyncio.Task[None] | None = None
-        self._reading: asyncio.Task[None] | None = None
-        self._floor_of: Scene | None = None
+        self._measuring: asyncio.Task[None] | None = None
+        self._floor_scene: Scene | None = None
         self._floors: dict[str, float | None] = {}
         self._pace = 0.0
         self._step = False
@@ -63,19 +63,19 @@ class Session:
 
     # Messages from the page --------------------------------------------------------------------
 
-    def wish(self, wish: Wish) -> None:
+    def receive(self, message: PageMessage) -> None:
         """Note what the page asks for; the loop acts on it with the next frame."""
-        if isinstance(wish, messages.Act | messages.Point):
-            self._source.hold(wish)
+        if isinstance(message, messages.Act | messages.Point):
+            self._source.hold(message)
         else:
-            self._note(wish)
+            self._note(message)
             self._wake.set()
             self._tell_state()
 
-    def _note(self, wish: Wish) -> None:
-        match wish:
+    def _note(self, message: PageMessage) -> None:
+        match message:
             case messages.Open():
-                self._wanted = wish
+                self._request = message
             case messages.TakeOver():
                 self._take_over = True
             case messages.Pause(on):
@@ -96,11 +96,11 @@ class Session:
     async def run(self) -> None:
         """Play one scene after another, as the page asks for them."""
         try:
-            while self._wanted is None:
-                await self._asked()
+            while self._request is None:
+                await self._wait_for_page()
             while True:
                 try:
-                    await self._go_on()
+                    await self._advance()
                 except Exception as error:
                     if not is_for_users(error):
                         raise
@@ -108,55 +108,55 @@ class Session:
                     self._predicting = None
                     self._source.stop()
                     await self._save()
-                    while self._wanted is None:
-                        await self._asked()
+                    while self._request is None:
+                        await self._wait_for_page()
         finally:
             await asyncio.shield(self._close())
 
-    async def _go_on(self) -> None:
+    async def _advance(self) -> None:
         """Do the next thing: what the page asks for, or the next latent frame."""
-        if self._wanted is not None or self._live is None:
-            await self._open(self._wanted or messages.Open())
+        if self._request is not None or self._live is None:
+            await self._open(self._request or messages.Open())
         elif self._take_over:
-            await self._start_over()
+            await self._restart_model()
         elif self._keep_recording != (self._recording is not None):
-            await self._settled()
-            await self._heed_recording()
+            await self._end_prediction()
+            await self._follow_recording()
         elif not await self._ready(self._live):
             pass  # it was waited for, and the page may have asked for something
         elif (self._clock.paused and not self._step) or self._source.over:
-            await self._asked()
+            await self._wait_for_page()
         else:
             await self._latent_frame(self._live)
 
-    async def _asked(self) -> None:
+    async def _wait_for_page(self) -> None:
         """Wait until the page asks for something."""
         self._wake.clear()
         await self._wake.wait()
 
-    async def _open(self, wanted: messages.Open) -> None:
-        self._wanted, self._take_over = None, False
+    async def _open(self, request: messages.Open) -> None:
+        self._request, self._take_over = None, False
         self._source.stop()
         with contextlib.suppress(Exception):  # it was shown
-            await self._settled()
+            await self._end_prediction()
         await self._save()
-        live, before = await self._set_up(wanted.world)
-        factors = wanted.factors
-        scene = Scene.drawn(factors) if wanted.index is None else Scene(wanted.index, factors)
+        live, before = await self._acquire(request.world)
+        factors = request.factors
+        scene = Scene.draw(factors) if request.index is None else Scene(request.index, factors)
         try:
-            time_step, seen = await live.begin(scene)
+            time_step, frame = await live.begin(scene)
         except Exception as error:
             if before is None or not is_for_users(error):
                 raise
             self._tell("notice", text=sentence(error), wrong=True)
-            time_step, seen = await live.begin(before)  # the last scene that worked
+            time_step, frame = await live.begin(before)  # the last scene that worked
         self._source.begin(live)
         self.outbox.forget_frames()
-        resting = await live.resting()
-        self._tell("world", **live.about(time_step), **resting, menu=self._pool.menu())
-        self._began(time_step, seen)
+        rest = await live.rest()
+        self._tell("world", **live.about(time_step), **rest, menu=self._pool.menu())
+        self._show_start(time_step, frame)
 
-    async def _set_up(self, name: str | None) -> tuple[LiveWorld, Scene | None]:
+    async def _acquire(self, name: str | None) -> tuple[LiveWorld, Scene | None]:
         """A running world (by default the same one), and the scene that it currently shows."""
         live = self._live
         world = self._pool.worlds.get(name or "") or (live.world if live else None)
@@ -167,20 +167,20 @@ class Session:
         self._live = None
         if live is not None:
             await self._pool.release(live)
-        made = await self._pool.acquire(world)
-        self._live, self._clock.fps = made, made.simulator.card.fps
-        return made, None
+        acquired = await self._pool.acquire(world)
+        self._live, self._clock.fps = acquired, acquired.simulator.card.fps
+        return acquired, None
 
-    async def _start_over(self) -> None:
+    async def _restart_model(self) -> None:
         assert self._live is not None
         self._take_over = False
-        await self._settled()
-        self._began(self._live.recent[-1], await self._live.take_over())
+        await self._end_prediction()
+        self._show_start(self._live.recent[-1], await self._live.take_over())
 
-    def _began(self, time_step: TimeStep, seen: NDArray[np.uint8]) -> None:
+    def _show_start(self, time_step: TimeStep, frame: NDArray[np.uint8]) -> None:
         """Show the start, where simulator and model show the same."""
-        self._last, self._alone = (time_step, seen), 0
-        self._show([time_step], seen[None], [self._source.seq])
+        self._last, self._alone = (time_step, frame), 0
+        self._show([time_step], frame[None], [self._source.seq])
         self._tell_state()
 
     async def _latent_frame(self, live: LiveWorld) -> None:
@@ -188,19 +188,19 @@ class Session:
         self._step = False
         time_steps: list[TimeStep] = []
         seqs: list[int] = []
-        began = time.monotonic()
-        while len(time_steps) < live.dream.stride:
+        start = time.monotonic()
+        while len(time_steps) < live.model.stride:
             await self._clock.tick()
-            if self._wanted is not None:
+            if self._request is not None:
                 return
             if await self._ready(live):
                 seqs.append(self._source.seq)
                 time_steps.append(await self._source.act(live))
-        await self._settled()
-        self._pace = (time.monotonic() - began) / len(time_steps)
+        await self._end_prediction()
+        self._pace = (time.monotonic() - start) / len(time_steps)
         self._predicting = asyncio.create_task(self._predict(live, time_steps, seqs))
 
-    async def _settled(self) -> None:
+    async def _end_prediction(self) -> None:
         """Wait until the running prediction has ended.
 
         Raises:
@@ -211,17 +211,17 @@ class Session:
             await task
 
     async def _predict(self, live: LiveWorld, time_steps: list[TimeStep], seqs: list[int]) -> None:
-        seen = await live.predict([time_step.action for time_step in time_steps])
+        frames = await live.predict([time_step.action for time_step in time_steps])
         self._alone += len(time_steps)
         if self._recording:
             self._recording.time_steps += time_steps
-            self._recording.dreamt += [*seen]
+            self._recording.model_frames += [*frames]
             if self._recording.frames >= MAX_FRAMES:
                 self._keep_recording = False
-        self._last = time_steps[-1], seen[-1]
-        self._show(time_steps, seen, seqs)
-        if self._reading is None or self._reading.done():
-            self._reading = asyncio.create_task(self._read(live, time_steps[-1], seen[-1]))
+        self._last = time_steps[-1], frames[-1]
+        self._show(time_steps, frames, seqs)
+        if self._measuring is None or self._measuring.done():
+            self._measuring = asyncio.create_task(self._measure(live, time_steps[-1], frames[-1]))
 
     async def _ready(self, live: LiveWorld) -> bool:
         """Whether the next action is known; if not, wait until a driver has planned it."""
@@ -249,42 +249,42 @@ class Session:
             recording=self._keep_recording,
         )
 
-    def _show(self, time_steps: list[TimeStep], seen: NDArray[np.uint8], seqs: list[int]) -> None:
+    def _show(self, time_steps: list[TimeStep], frames: NDArray[np.uint8], seqs: list[int]) -> None:
         live, progress = self._live, time_steps[-1].progress
         assert live is not None
         header = {
             "seqs": seqs,
             "alone": self._alone / live.simulator.card.fps,
             "pace": self._pace,
-            "pixel_error": pixel_error(seen[-1], time_steps[-1].frame),
-            "spread": live.dream.spread,
+            "pixel_error": pixel_error(frames[-1], time_steps[-1].frame),
+            "spread": live.model.spread,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
             "progress": dataclasses.asdict(progress) if progress else None,
             "places": None if self._source.driver == PERSON else live.places(time_steps[-1].action),
         }
-        self.outbox.put_frames(pack(header, np.stack([m.frame for m in time_steps]), seen))
+        self.outbox.put_frames(pack(header, np.stack([m.frame for m in time_steps]), frames))
         self._more.set()
 
-    async def _read(self, live: LiveWorld, time_step: TimeStep, seen: NDArray[np.uint8]) -> None:
-        alone, scene, began = self._alone / live.simulator.card.fps, live.scene, time.monotonic()
-        floor = scene is not self._floor_of
+    async def _measure(self, live: LiveWorld, truth: TimeStep, frame: NDArray[np.uint8]) -> None:
+        alone, scene, start = self._alone / live.simulator.card.fps, live.scene, time.monotonic()
+        floor = scene is not self._floor_scene
         run = self._pool.workers.run
         try:
-            read = await run("instruments", live.instruments.read, seen, time_step, floor)
+            figures = await run("instruments", live.instruments.measure, frame, truth, floor)
         except Exception as error:
             if not is_for_users(error):
                 raise
             self._tell("notice", text=sentence(error), wrong=True)
             return
         if live is self._live and scene is live.scene:
-            self._floor_of, self._floors = scene, read.floors or self._floors
-            self._tell("figures", alone=alone, **{**read._asdict(), "floors": self._floors})
-        await asyncio.sleep(REST * (time.monotonic() - began))
+            self._floor_scene, self._floors = scene, figures.floors or self._floors
+            self._tell("figures", alone=alone, **{**figures._asdict(), "floors": self._floors})
+        await asyncio.sleep(REST * (time.monotonic() - start))
 
     # Recordings --------------------------------------------------------------------------------
 
-    async def _heed_recording(self) -> None:
+    async def _follow_recording(self) -> None:
         """Start or end a recording, between latent frames."""
         if self._keep_recording and self._recording is None and self._last is not None:
             self._recording = Recording([self._last[0]], [self._last[1]])
@@ -298,12 +298,12 @@ class Session:
             return
         card = self._live.simulator.card
         try:
-            saved = await self._pool.workers.run("disk", save, recording, card, self._out)
+            run = self._pool.workers.run
+            folder, index, video = await run("disk", save, recording, card, self._out)
         except (AcwmError, OSError) as error:
             self._keep_recording = False
             self._tell("notice", text=f"Not saved: {error}", wrong=True)
         else:
-            folder, index, video = saved
             seconds = (recording.frames - 1) / card.fps
             text = f"Saved {seconds:.1f} s as episode {index} of {folder}, and as {video}"
             self._tell("notice", text=text, wrong=False)
@@ -311,7 +311,7 @@ class Session:
 
     async def _close(self) -> None:
         self._source.stop()
-        for task in (self._predicting, self._reading):
+        for task in (self._predicting, self._measuring):
             if task:
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError, AcwmError):

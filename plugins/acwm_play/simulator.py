@@ -34,7 +34,7 @@ class Scene:
     factors: Mapping[str, FactorValue] = field(default_factory=dict[str, FactorValue])
 
     @classmethod
-    def drawn(cls, factors: Mapping[str, FactorValue]) -> Scene:
+    def draw(cls, factors: Mapping[str, FactorValue]) -> Scene:
         """Draw a random scene with these factors."""
         return cls(secrets.randbelow(SCENES), factors)
 
@@ -94,9 +94,9 @@ class Simulator:
         self._spec = EpisodeSpec(self.card.name)
         self._takeovers = 0
         self._name = environment
-        self._second: Environment | None = None
+        self._goal_drawer: Environment | None = None
         self._goals: dict[str, Goal] = {}
-        self._aiming: TaskEnvironment | None = None
+        self._goal_environment: TaskEnvironment | None = None
         self._solved = False
 
     def start(self, scene: Scene, frames: int = 1) -> list[TimeStep]:
@@ -109,7 +109,7 @@ class Simulator:
         with noting(f"in scene {scene.index}", self.environment):
             frame, info = self.environment.reset(options={"spec": spec})
         self._spec, self._policy = spec, None
-        self._goals, self._aiming = {}, None
+        self._goals, self._goal_environment = {}, None
         time_steps = [self._time_step(frame, info, np.zeros(self.card.action.size, np.float32))]
         return time_steps + [self.step(self.still()) for _ in range(frames - 1)]
 
@@ -117,10 +117,10 @@ class Simulator:
         """Advance by one frame; the action is clipped to its bounds."""
         action_spec = self.card.action
         low, high = (np.asarray(b, np.float32) for b in (action_spec.low, action_spec.high))
-        taken = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
+        clipped = np.clip(np.nan_to_num(np.asarray(action, np.float32)), low, high)
         with noting("while playing", self.environment):
-            frame, _, _, _, info = (self._aiming or self.environment).step(taken)
-        return self._time_step(frame, info, taken)
+            frame, _, _, _, info = (self._goal_environment or self.environment).step(clipped)
+        return self._time_step(frame, info, clipped)
 
     def aim(self, task: str) -> tuple[Goal, TaskProgress]:
         """Set the goal of a task in this scene; from now on, time steps say how they stand to it.
@@ -131,20 +131,21 @@ class Simulator:
             UnknownNameError: the environment has no such task.
             RecipeError: the scene has no goal that is not reached at its start.
         """
-        found: Task = catalog().component("environment", self._name).load_task(task)
+        goal_task: Task = catalog().component("environment", self._name).load_task(task)
         with noting(f"in scene {self._spec.index}", self.environment):
             if task not in self._goals:
-                if self._second is None:
+                if self._goal_drawer is None:
                     size = {"size": list(self.card.frame_size)}
-                    self._second = make_environment(self._name, size)
-                drawn = TaskEnvironment(self._second, found)
-                drawn.reset(options={"spec": self._spec})
-                self._goals[task] = drawn.goal
-            self._aiming, self._solved = TaskEnvironment(self.environment, found), False
-            self._aiming.goal = self._goals[task]
+                    self._goal_drawer = make_environment(self._name, size)
+                drawing = TaskEnvironment(self._goal_drawer, goal_task)
+                drawing.reset(options={"spec": self._spec})
+                self._goals[task] = drawing.goal
+            self._goal_environment = TaskEnvironment(self.environment, goal_task)
+            self._solved = False
+            self._goal_environment.goal = self._goals[task]
             _, info = self.environment.observe()
-            self._aiming.judge(info)
-        return self._aiming.goal, self._progress(info)
+            self._goal_environment.judge(info)
+        return self._goal_environment.goal, self._progress(info)
 
     def still(self) -> NDArray[np.float32]:
         """The action that means no motion."""
@@ -162,7 +163,7 @@ class Simulator:
 
     def close(self) -> None:
         """Free the environments' resources."""
-        for each in (self.environment, self._second):
+        for each in (self.environment, self._goal_drawer):
             if each is not None:
                 each.close()
 
@@ -170,7 +171,7 @@ class Simulator:
         self, frame: NDArray[np.uint8], info: Mapping[str, Any], action: NDArray[np.float32]
     ) -> TimeStep:
         names = ("mask", "state", "contacts", "factors", "ood_label")
-        progress = self._progress(info) if self._aiming else None
+        progress = self._progress(info) if self._goal_environment else None
         return TimeStep(frame, **{n: info[n] for n in names}, action=action, progress=progress)
 
     def _progress(self, info: Mapping[str, Any]) -> TaskProgress:

@@ -14,14 +14,16 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Task
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
+from acwm_core.training.trained import find_run
 from acwm_planning.planner import Driver
-from acwm_play.dream import Dream
-from acwm_play.worlds import World, load, usual_actions
+from acwm_planning.run import usual_actions
+from acwm_play.live_model import LiveModel
+from acwm_play.worlds import World, load
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-Where = Literal["model", "driver", "instruments", "disk"]
+ThreadName = Literal["model", "driver", "instruments", "disk"]
 
 
 class Workers:
@@ -32,22 +34,26 @@ class Workers:
     """
 
     def __init__(self, steps: int | None = None) -> None:
-        self._pools = {name: ThreadPoolExecutor(1, f"acwm-play-{name}") for name in get_args(Where)}
+        self._pools = {
+            name: ThreadPoolExecutor(1, f"acwm-play-{name}") for name in get_args(ThreadName)
+        }
         self._steps = steps
-        self._models: dict[tuple[Where, str], WorldModel] = {}
+        self._models: dict[tuple[ThreadName, str], WorldModel] = {}
 
-    async def run(self, where: Where, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
+    async def run(
+        self, thread: ThreadName, work: Callable[P, T], *args: P.args, **more: P.kwargs
+    ) -> T:
         """Run `work` in one of the threads, after the work already queued there."""
-        pool, loop = self._pools[where], asyncio.get_running_loop()
+        pool, loop = self._pools[thread], asyncio.get_running_loop()
         return await loop.run_in_executor(pool, lambda: work(*args, **more))
 
-    def dream(self, world: World, card: EnvironmentCard) -> Dream:
+    def live_model(self, world: World, card: EnvironmentCard) -> LiveModel:
         """Create a stream of a world's model.
 
         Raises:
             AcwmError: the model cannot be loaded, or cannot be played in this environment.
         """
-        return Dream(self._model("model", world), card, self._steps)
+        return LiveModel(self._model("model", world), card, self._steps)
 
     def driver(self, name: str, world: World, card: EnvironmentCard, task: Task) -> Driver:
         """Create a driver of a world, with a copy of its model, because both work at once.
@@ -63,13 +69,13 @@ class Workers:
                 world_model=self._model("driver", world),
                 card=card,
                 task=task,
-                usual=usual_actions(world),
+                usual=usual_actions(find_run(world.run)),
                 steps=self._steps,
             )
         )
 
-    def _model(self, where: Where, world: World) -> WorldModel:
-        key = where, str(world.run)
+    def _model(self, thread: ThreadName, world: World) -> WorldModel:
+        key = thread, str(world.run)
         if key not in self._models:
             self._models[key] = load(world).world_model
         return self._models[key]

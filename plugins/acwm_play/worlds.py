@@ -60,8 +60,8 @@ def playable(
     if environment:
         installed.sort(key=lambda world: world.environment != environment)
     simulators = catalog().registry("environment")
-    found = [*given, *(world for world in installed if world.environment in simulators)]
-    if not given and (not found or environment not in (None, found[0].environment)):
+    worlds = [*given, *(world for world in installed if world.environment in simulators)]
+    if not given and (not worlds or environment not in (None, worlds[0].environment)):
         what = f"of {environment} " if environment else ""
         raise TrainingError(
             f"no trained model {what}is installed: train one, as `acwm demo` does, and name its "
@@ -73,7 +73,9 @@ def playable(
                 f"no simulator of {world.environment}, the world of {world.run}, is installed: "
                 "choose another with --env"
             )
-    return [dataclasses.replace(world, name=name) for name, world in _named(found).items()]
+    return [
+        dataclasses.replace(world, name=name) for name, world in _by_unique_name(worlds).items()
+    ]
 
 
 def load(world: World) -> RunBundle:
@@ -85,25 +87,14 @@ def load(world: World) -> RunBundle:
     return load_run(world.run)
 
 
-def usual_actions(world: World) -> list[float] | None:
-    """Standard deviation `[A]` of the raw actions that a world's model was trained on, if known.
-
-    Raises:
-        DataError: the run has no readable card.
-    """
-    card = DatasetCard.read(RunFolder(find_run(world.run)).card)
-    statistics = card.actions.get("train")
-    return None if statistics is None else [*statistics["std"]]
-
-
 def tasks_of(environment: str) -> dict[str, Task]:
     """The tasks of a world by name, without those that cannot be loaded."""
     component = catalog().component("environment", environment)
-    found: dict[str, Any] = {}
+    tasks: dict[str, Any] = {}
     for name in component.tasks:
         with contextlib.suppress(Exception):  # whatever a plugin raises
-            found[name] = component.load_task(name)
-    return {name: task for name, task in found.items() if isinstance(task, Task)}
+            tasks[name] = component.load_task(name)
+    return {name: task for name, task in tasks.items() if isinstance(task, Task)}
 
 
 def _world(
@@ -120,10 +111,10 @@ def _world(
     return World(name, run, environment or card.name, size or card.frame_size)
 
 
-def _named(worlds: Sequence[World]) -> dict[str, World]:
+def _by_unique_name(worlds: Sequence[World]) -> dict[str, World]:
     """Worlds by unique name; duplicates get their folder or a number as a name."""
-    named: dict[str, World] = {}
+    by_name: dict[str, World] = {}
     for world in worlds:
         names = [world.name, str(world.run), *(f"{world.run} ({n})" for n in range(2, 1000))]
-        named[next(name for name in names if name not in named)] = world
-    return named
+        by_name[next(name for name in names if name not in by_name)] = world
+    return by_name

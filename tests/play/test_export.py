@@ -19,7 +19,7 @@ from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_play.export import episodes, graphs, page, runtime
-from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, exported
+from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, export_graphs
 from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import Scene, Simulator
 from acwm_play.worlds import playable
@@ -56,7 +56,7 @@ def recurrent_world(given=1):
 @pytest.mark.slow
 def test_the_graphs_of_a_model_that_is_given_more_frames_are_its_stream():
     world = recurrent_world(given=5)
-    made = exported(world, SIZE)
+    made = export_graphs(world, SIZE)
     given = torch.rand(1, 5, 3, *SIZE)
     actions = torch.rand(1, 4 + 24, 2) * 2 - 1
     truth = world.stream(given, actions[:, :4])
@@ -76,23 +76,23 @@ def test_models_that_cannot_be_exported_are_refused():
     world = recurrent_world()
     world.model = follower.Follower(latent_channels=world.codec.channels)
     with pytest.raises(RecipeError, match="a Follower cannot be exported: choose"):
-        exported(world, SIZE)
+        export_graphs(world, SIZE)
     world = recurrent_world()
     world.codec.memoryless = False
     with pytest.raises(RecipeError, match="decodes with a memory"):
-        exported(world, SIZE)
+        export_graphs(world, SIZE)
 
 
 def test_an_old_pytorch_is_refused(monkeypatch):
     monkeypatch.setattr(graphs, "NEEDS_TORCH", "99.1")
     with pytest.raises(RecipeError, match=r"--export needs PyTorch 99\.1 or later, not "):
-        exported(recurrent_world(), SIZE)
+        export_graphs(recurrent_world(), SIZE)
 
 
 def test_homographies_say_where_actions_point():
     pytest.importorskip("mujoco", reason="needs the extra rigid")
     simulator = Simulator("push_cube", SIZE)
-    pointing = Pointing.found(simulator, physics_of("push_cube"))
+    pointing = Pointing.fit(simulator, physics_of("push_cube"))
     action = simulator.card.action
     ((there, back),) = episodes.maps(pointing, action.low, action.high)
     simulator.close()
@@ -171,8 +171,8 @@ def written(tmp_path_factory):
     model = {"name": "recurrent", "channels": 8, "width": 16, "blocks": 1}
     run = follower.make_run(folder / "run", model=model, conditioner="adaln")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page, "EPISODES", 2)
-        patch.setattr(episodes, "SECONDS", 1.6)
+        patch.setattr(page, "EPISODE_COUNT", 2)
+        patch.setattr(episodes, "EPISODE_SECONDS", 1.6)
         if not has_runtime():
             patch.setattr(page, "runtime", lambda _: dict.fromkeys(runtime.FILES, b""))
         world = playable([run])[0]

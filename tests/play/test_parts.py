@@ -142,9 +142,9 @@ def test_a_port_that_is_taken_is_refused_and_the_usual_one_replaced(monkeypatch)
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(RecipeError, match=f"port {port} is taken"):
-            address.listening(port)
+            address.open_socket(port)
         monkeypatch.setattr(address, "PORT", port)
-        with address.listening(None) as free:
+        with address.open_socket(None) as free:
             assert free.getsockname()[1] not in (port, 0)
             assert free.getsockname()[0] == "127.0.0.1"
 

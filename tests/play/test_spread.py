@@ -12,8 +12,8 @@ from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
-from acwm_play import dream
-from acwm_play.dream import Dream
+from acwm_play import live_model
+from acwm_play.live_model import LiveModel
 from tests.play import follower
 
 FIT = {"width": 16, "layers": 1, "heads": 2}
@@ -54,12 +54,12 @@ ACTIONS = [np.full(2, 0.5, np.float32)] * 4
 
 
 def test_the_spread_is_that_of_single_streams(world, frame, monkeypatch):
-    monkeypatch.setattr(dream, "SHARE", float("inf"))
-    played = Dream(world, CARD, None)
+    monkeypatch.setattr(live_model, "SHARE", float("inf"))
+    played = LiveModel(world, CARD, None)
     played.restart(frame, [])
     assert played.spread is None
     given = torch.from_numpy(frame).permute(0, 3, 1, 2)[None] / 255
-    streams = [world.stream(given, seeds=[seed]) for seed in range(dream.SAMPLES)]
+    streams = [world.stream(given, seeds=[seed]) for seed in range(live_model.SAMPLES)]
     for _ in range(2):
         shown = played.step(ACTIONS)
         alone = [s.step(torch.from_numpy(np.stack(ACTIONS)[None]))[0] for s in streams]
@@ -71,8 +71,8 @@ def test_the_spread_is_that_of_single_streams(world, frame, monkeypatch):
 
 
 def test_samples_end_where_they_take_too_long(world, frame, monkeypatch):
-    monkeypatch.setattr(dream, "SHARE", -1.0)
-    played = Dream(world, CARD, None)
+    monkeypatch.setattr(live_model, "SHARE", -1.0)
+    played = LiveModel(world, CARD, None)
     played.restart(frame, [])
     played.step(ACTIONS)
     assert played.spread is not None
@@ -88,7 +88,7 @@ def test_a_model_without_noise_has_none(frame):
     codec = catalog().create("codec", "identity")
     card = SimpleNamespace(**{**vars(CARD), "frame_size": (64, 64)})
     world = world_of(follower.Follower(latent_channels=codec.channels), codec)
-    played = Dream(world, card, None)
+    played = LiveModel(world, card, None)
     played.restart(np.zeros((1, 64, 64, 3), np.uint8), [])
     played.step(ACTIONS)
     assert played.spread is None

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from acwm_play.layout import Pointing
 from acwm_play.simulator import Scene, Simulator
 
-EPISODES = 4
-SECONDS = 12.0
+EPISODE_COUNT = 4
+EPISODE_SECONDS = 12.0
 """Length of each episode after the given frames."""
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedEpisode:
     """An episode with the world's behaviour policy.
 
     Attributes:
@@ -42,7 +42,7 @@ class Recorded:
         }
 
 
-def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorded:
+def record(simulator: Simulator, index: int, given: int, stride: int) -> RecordedEpisode:
     """Simulate a scene.
 
     Args:
@@ -51,13 +51,13 @@ def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorde
         given: number of first frames without motion, which a model starts from.
         stride: video frames per latent frame; the episode ends with a whole latent frame.
     """
-    latent_frames = round(SECONDS * simulator.card.fps / stride)
+    latent_frames = round(EPISODE_SECONDS * simulator.card.fps / stride)
     time_steps = simulator.start(Scene(index), given)
     stills = [simulator.still()] * given
     for _ in range(stride * latent_frames):
         time_steps.append(simulator.step_by_policy(anew=False))
         stills.append(simulator.still())
-    return Recorded(
+    return RecordedEpisode(
         index,
         np.stack([time_step.frame for time_step in time_steps]),
         np.stack([time_step.action for time_step in time_steps[1:]]),
@@ -72,7 +72,7 @@ def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) ->
     hold everything that `pointing` knows.
     """
     shares = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 2), -1).reshape(-1, 2)
-    found: list[Any] = []
+    homographies: list[Any] = []
     for k in range(len(low) // 2):
         ends = [np.array(bound)[2 * k : 2 * k + 2] for bound in (low, high)]
         actions = ends[0] + shares * (ends[1] - ends[0])
@@ -80,8 +80,8 @@ def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) ->
         whole[:, 2 * k : 2 * k + 2] = actions
         places = np.stack([pointing.places(row)[k] for row in whole])
         there = _homography(places, actions)
-        found.append([there.tolist(), np.linalg.inv(there).tolist()])
-    return found
+        homographies.append([there.tolist(), np.linalg.inv(there).tolist()])
+    return homographies
 
 
 def _homography(sources: NDArray[np.float64], targets: NDArray[np.float64]) -> NDArray[np.float64]:

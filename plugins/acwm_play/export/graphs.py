@@ -58,7 +58,7 @@ class _Part(nn.Module):
     def model(self) -> CarriesState:
         return cast(CarriesState, self.world.model)
 
-    def embedded(self, actions: Actions) -> Conditioning:
+    def embed(self, actions: Actions) -> Conditioning:
         """Conditioning of a first latent frame and of the one that raw actions lead to."""
         rows = self.world.normalise(torch.cat([actions, torch.zeros_like(actions[:, :1])], 1))
         return self.world.conditioner.condition(rows, 2, self.world.model.width)
@@ -71,7 +71,7 @@ class Start(_Part):
         """Encode the frames and start the stream."""
         latents = self.world.codec.encode(given)
         stride, size = self.world.codec.temporal_stride, len(self.world.action_low)
-        nothing = self.embedded(given.new_zeros(1, stride, size))
+        nothing = self.embed(given.new_zeros(1, stride, size))
         return latents[:, -1:], *self.model.initial_state(latents, nothing)
 
 
@@ -80,7 +80,7 @@ class Step(_Part):
 
     def forward(self, actions: Actions, *state: Tensor) -> tuple[Tensor, ...]:
         """Predict one latent frame."""
-        latent, moved = self.model.next_state(state, self.embedded(actions))
+        latent, moved = self.model.next_state(state, self.embed(actions))
         return latent, *moved
 
 
@@ -96,7 +96,7 @@ class Decode(_Part):
         return decoder(latent), decoder(latent)
 
 
-def exported(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
+def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
     """Export the graphs, by name.
 
     Args:
@@ -175,7 +175,7 @@ class OnnxStream:
     """Streams with the graphs, as the page does, but in Python.
 
     Args:
-        graphs: see `exported`.
+        graphs: see `export_graphs`.
         given: frames `[K, 3, H, W]` in [0, 1].
 
     Attributes:
@@ -213,7 +213,7 @@ def check(
     """Compare the graphs with the PyTorch stream; returns the largest difference of a pixel.
 
     Args:
-        graphs: see `exported`.
+        graphs: see `export_graphs`.
         world: the model that they were made from.
         given: frames `[K, 3, H, W]` in [0, 1], as many as the model is given.
         actions: raw actions, `[n · stride, A]`.
@@ -227,8 +227,8 @@ def check(
     worst = float(np.abs(stream.given - truth.given[0, -1].numpy()).max())
     for start in range(0, len(actions), stride):
         rows = actions[start : start + stride]
-        wanted = truth.step(torch.from_numpy(rows)[None])[0].numpy()
-        worst = max(worst, float(np.abs(stream.step(rows) - wanted).max()))
+        expected = truth.step(torch.from_numpy(rows)[None])[0].numpy()
+        worst = max(worst, float(np.abs(stream.step(rows) - expected).max()))
     if not worst <= TOLERANCE:
         raise RecipeError(
             f"the exported model differs from the original by {worst:.2g} of full scale, because "

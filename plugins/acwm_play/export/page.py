@@ -14,16 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from acwm_core.errors import RecipeError
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.files import made_whole, writing
 from acwm_play.about import about_world, places
-from acwm_play.dream import Dream
-from acwm_play.export.episodes import EPISODES, Recorded, maps, record
-from acwm_play.export.graphs import check, exported
+from acwm_play.export.episodes import EPISODE_COUNT, RecordedEpisode, maps, record
+from acwm_play.export.graphs import check, export_graphs
 from acwm_play.export.runtime import runtime
 from acwm_play.layout import Pointing, controls, physics_of
+from acwm_play.live_model import LiveModel
 from acwm_play.simulator import Simulator
 from acwm_play.worlds import World, load
 
@@ -58,18 +57,18 @@ def export(world: World, folder: Path, package: Path | None = None) -> Path:
     model = load(world).world_model
     simulator = Simulator(world.environment, world.size)
     try:
-        dream = Dream(model, simulator.card, None)
-        graphs = exported(model, world.size)
+        live = LiveModel(model, simulator.card, None)
+        graphs = export_graphs(model, world.size)
         parts = {**graphs, **runtime(package)}
-        pointing = Pointing.found(simulator, physics_of(world.environment))
-        episodes = [record(simulator, k, dream.given, dream.stride) for k in range(EPISODES)]
-        about = _about(world, simulator, dream, pointing, episodes)
+        pointing = Pointing.fit(simulator, physics_of(world.environment))
+        episodes = [record(simulator, k, live.given, live.stride) for k in range(EPISODE_COUNT)]
+        about = _about(world, simulator, live, pointing, episodes)
     finally:
         simulator.close()
-    first, seconds = episodes[0], round(CHECKED_SECONDS * simulator.card.fps / dream.stride)
-    given = torch.from_numpy(first.frames[: dream.given]).permute(0, 3, 1, 2) / 255
-    checked = first.actions[dream.given - 1 :][: dream.stride * seconds]
-    check(graphs, model, given.numpy(), checked)
+    first, seconds = episodes[0], round(CHECKED_SECONDS * simulator.card.fps / live.stride)
+    given = as_clip(first.frames[: live.given])
+    actions = first.actions[live.given - 1 :][: live.stride * seconds]
+    check(graphs, model, given.numpy(), actions)
     parts["about"] = json.dumps(about).encode()
     parts.update({f"episode{e.index}": e.frames.tobytes() for e in episodes})
     with writing(folder), made_whole(folder) as partial:
@@ -80,13 +79,13 @@ def export(world: World, folder: Path, package: Path | None = None) -> Path:
 def _about(
     world: World,
     simulator: Simulator,
-    dream: Dream,
+    live: LiveModel,
     pointing: Pointing | None,
-    episodes: list[Recorded],
+    episodes: list[RecordedEpisode],
 ) -> dict[str, Any]:
     card = simulator.card
-    described = controls(card, physics_of(world.environment))
-    about = about_world(world.name, card, dream.stride, described, pointing)
+    layout = controls(card, physics_of(world.environment))
+    about = about_world(world.name, card, live.stride, layout, pointing)
     rest = episodes[0].stills[0]
     return {
         **about,
@@ -102,7 +101,7 @@ def _about(
         "menu": [(world.name, card.name)],
         "rest": rest.tolist(),
         "places": places(pointing, rest),
-        "given": dream.given,
+        "given": live.given,
         "maps": maps(pointing, card.action.low, card.action.high) if pointing else [],
         "episodes": [episode.about() for episode in episodes],
     }

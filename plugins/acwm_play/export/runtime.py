@@ -50,12 +50,12 @@ def _fetch(dist: Path) -> None:
         )
     with tempfile.TemporaryDirectory() as scratch:
         words = [npm, "pack", f"{PACKAGE}@{VERSION}", "--silent", "--pack-destination", scratch]
-        done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=scratch)
-        packed = list(Path(scratch).glob("*.tgz"))
-        if done.returncode or not packed:
-            said = (done.stderr.strip() or "it is not there").splitlines()[-1]
-            raise DataError(f"npm could not fetch {PACKAGE} {VERSION}: {said}")
-        with writing(dist), made_whole(dist) as partial, tarfile.open(packed[0]) as archive:
+        process = subprocess.run(words, capture_output=True, text=True, check=False, cwd=scratch)
+        packages = list(Path(scratch).glob("*.tgz"))
+        if process.returncode or not packages:
+            reason = (process.stderr.strip() or "it is not there").splitlines()[-1]
+            raise DataError(f"npm could not fetch {PACKAGE} {VERSION}: {reason}")
+        with writing(dist), made_whole(dist) as partial, tarfile.open(packages[0]) as archive:
             for name in FILES.values():
                 file = archive.extractfile(f"package/dist/{name}")
                 assert file is not None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError, noting
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
@@ -24,7 +25,7 @@ SHARE = 0.5
 """Share of real time that prediction with all samples may take."""
 
 
-class Dream:
+class LiveModel:
     """A stream of a world model that can be restarted from the simulator's frames.
 
     Args:
@@ -46,12 +47,13 @@ class Dream:
 
     def __init__(self, world_model: WorldModel, card: EnvironmentCard, steps: int | None) -> None:
         low, high = world_model.action_low.tolist(), world_model.action_high.tolist()
-        if len(low) != card.action.size or not np.allclose([low, high], _bounds(card)):
+        action = card.action
+        if len(low) != action.size or not np.allclose([low, high], [action.low, action.high]):
             raise ShapeError(
                 f"the model was trained on other actions than those of {card.name}: choose the "
                 "world of its data, or a variant of that, with --env"
             )
-        self._world = world_model
+        self._world_model = world_model
         self._steps = steps
         self.stride = world_model.codec.temporal_stride
         self.given = world_model.context_frames
@@ -71,12 +73,12 @@ class Dream:
         Returns:
             The last frame as the model sees it, `[H, W, 3]` uint8.
         """
-        video = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)[None] / 255
+        video = as_clip(frames)[None]
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
-        with noting("when the model begins", *self._world.children()):
-            self._stream = self._world.stream(video, between, steps=self._steps)
-            if self._world.objective.steps:
-                self._others = self._world.stream(
+        with noting("when the model begins", *self._world_model.children()):
+            self._stream = self._world_model.stream(video, between, steps=self._steps)
+            if self._world_model.objective.steps:
+                self._others = self._world_model.stream(
                     video.expand(SAMPLES - 1, -1, -1, -1, -1),
                     None if between is None else between.expand(SAMPLES - 1, -1, -1),
                     steps=self._steps,
@@ -87,21 +89,17 @@ class Dream:
 
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
         """Predict the frames `[stride, H, W, 3]` uint8 for `stride` raw actions."""
-        rows, began = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
-        with noting("while the model predicts", *self._world.children()):
-            seen = self._stream.step(rows)
+        rows, start = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
+        with noting("while the model predicts", *self._world_model.children()):
+            video = self._stream.step(rows)
             self.spread = None
             if self._others is not None:
                 others = self._others.step(rows.expand(SAMPLES - 1, -1, -1))
-                self.spread = _spread(torch.cat([seen, others])[:, -1])
-        if time.monotonic() - began > self._patience:
+                self.spread = _spread(torch.cat([video, others])[:, -1])
+        if time.monotonic() - start > self._patience:
             self._others = None  # until the next restart
-        return to_pixels(seen[0])
+        return to_pixels(video[0])
 
 
 def _spread(frames: torch.Tensor) -> float:
     return float(frames.var(0).mean().sqrt())
-
-
-def _bounds(card: EnvironmentCard) -> list[tuple[float, ...]]:
-    return [card.action.low, card.action.high]
