@@ -17,6 +17,7 @@ from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import DataError, RecipeError, noting, suggest
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.evaluation.videos import to_pixels
@@ -68,23 +69,23 @@ class DreamSettings:
                 raise RecipeError(f"{name}={value!r}: give 1 or more")
 
 
-def settings_of(words: Mapping[str, Any]) -> DreamSettings:
+def settings_of(arguments: Mapping[str, Any]) -> DreamSettings:
     """Build the settings from keyword arguments.
 
     Raises:
         RecipeError: a setting does not exist, or `run` is missing.
     """
-    known = [each.name for each in fields(DreamSettings)]
-    for name in words:
-        if name not in known:
-            raise RecipeError(f"acwm/dream-v0 has no argument {name!r}{suggest(name, known)}")
-    if "run" not in words:
+    names = [each.name for each in fields(DreamSettings)]
+    for name in arguments:
+        if name not in names:
+            raise RecipeError(f"acwm/dream-v0 has no argument {name!r}{suggest(name, names)}")
+    if "run" not in arguments:
         raise RecipeError("name the model: run='runs/mine', or a trained one's name")
-    return DreamSettings(**words)
+    return DreamSettings(**arguments)
 
 
 @dataclass
-class _Place:
+class _EpisodeState:
     """State of one of the parallel episodes."""
 
     goal: Goal | None = None
@@ -100,7 +101,7 @@ class _Group:
     members: list[int | None] = field(default_factory=list[int | None])
 
 
-class Seen(NamedTuple):
+class StepResult(NamedTuple):
     """What n episodes show after a step, or at the start."""
 
     frames: Frames  # `[n, H, W, 3]`
@@ -150,7 +151,7 @@ class Dreams:
                 )
         frames = self.task.max_steps if self.task else self.card.horizon - 1
         self.max_steps = -(-(settings.max_steps or frames) // self.repeat)
-        self._places = [_Place() for _ in range(number)]
+        self._states = [_EpisodeState() for _ in range(number)]
         self._groups: list[_Group] = []
         blank = np.zeros((*self.card.frame_size, 3), np.uint8)
         try:
@@ -176,25 +177,27 @@ class Dreams:
         check_options(options, self.starts)
         goal = options.get("goal")
         if isinstance(goal, np.ndarray):
-            goal = self._pictured(goal)
+            goal = self._goal_of_picture(goal)
         if "frame" in options:
-            made = picture_start(self.card, self._given, options["frame"], goal)
+            start = picture_start(self.card, self._given, options["frame"], goal)
         else:
-            drawn = {name: options[name] for name in self.starts.options if name in options}
-            made = self.starts.draw(rng, drawn)
-            made = made._replace(goal=goal or made.goal)
-        if self.task is not None and not isinstance(made.goal, Goal):
+            own_options = {name: options[name] for name in self.starts.options if name in options}
+            start = self.starts.draw(rng, own_options)
+            start = start._replace(goal=goal or start.goal)
+        if self.task is not None and not isinstance(start.goal, Goal):
             raise RecipeError("the task needs a goal: give one in options, a Goal or its picture")
-        return made
+        return start
 
-    def _pictured(self, picture: Frames) -> Goal:
+    def _goal_of_picture(self, picture: Frames) -> Goal:
         if self._estimator is None:
             raise RecipeError("no estimator reads the goal's picture: give a Goal")
-        checked = picture_start(self.card, 1, picture, None).frames
-        seen = self._estimator.read(_video(checked))
+        frames = picture_start(self.card, 1, picture, None).frames
+        seen = self._estimator.read(as_clip(frames))
         return Goal({n: values[0] for n, values in seen.states.items()}, seen.masks[0], picture)
 
-    def restart(self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]) -> Seen:
+    def restart(
+        self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]
+    ) -> StepResult:
         """Restart some episodes, each with noise from its own seed."""
         for group in self._groups:
             group.members = [None if member in which else member for member in group.members]
@@ -202,29 +205,29 @@ class Dreams:
         stream = self._open(starts, seeds)
         self._groups.append(_Group(stream, [*which]))
         for place, start in zip(which, starts, strict=True):
-            self._places[place] = _Place(start.goal)
-        return self._judged(which, to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None])
+            self._states[place] = _EpisodeState(start.goal)
+        return self._judge_frames(which, to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None])
 
-    def step(self, which: Sequence[int], actions: NDArray[np.float32]) -> Seen:
+    def step(self, which: Sequence[int], actions: NDArray[np.float32]) -> StepResult:
         """Advance some episodes, given in ascending order, with raw actions `[n, A]`.
 
         Raises:
             ActionError: the actions have the wrong size, are not finite, or are out of bounds.
         """
-        taken = dict(zip(which, actions, strict=True))
-        shown: dict[int, Frames] = {}
+        by_episode = dict(zip(which, actions, strict=True))
+        frames: dict[int, Frames] = {}
         for group in self._groups:
-            if not taken.keys() & {*group.members}:
+            if not by_episode.keys() & {*group.members}:
                 continue
             # for slots that are no longer used
             spare = np.array(self.card.action.low, np.float32)
-            rows = np.stack([taken.get(-1 if m is None else m, spare) for m in group.members])
-            held = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
+            rows = np.stack([by_episode.get(-1 if m is None else m, spare) for m in group.members])
+            inputs = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
             with noting("while the model predicts", *self._world.children()):
-                video = group.stream.step(held.to(self._world.action_low.device))
+                video = group.stream.step(inputs.to(self._world.action_low.device))
             pixels = to_pixels(video.flatten(0, 1)).reshape(*video.shape[:2], *self._shape)
-            shown |= {m: pixels[k] for k, m in enumerate(group.members) if m in taken}
-        return self._judged(which, np.stack([shown[place] for place in which]))
+            frames |= {m: pixels[k] for k, m in enumerate(group.members) if m in by_episode}
+        return self._judge_frames(which, np.stack([frames[place] for place in which]))
 
     @property
     def _shape(self) -> tuple[int, int, int]:
@@ -232,29 +235,29 @@ class Dreams:
 
     def _open(self, starts: Sequence[Start], seeds: Sequence[int]) -> Stream:
         device = self._world.action_low.device
-        video = torch.stack([_video(start.frames) for start in starts]).to(device)
+        video = torch.stack([as_clip(start.frames) for start in starts]).to(device)
         between = torch.from_numpy(np.stack([start.actions for start in starts])).to(device)
         with noting("when the model begins", *self._world.children()):
             return self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
 
-    def _judged(self, which: Sequence[int], frames: Frames) -> Seen:
+    def _judge_frames(self, which: Sequence[int], frames: Frames) -> StepResult:
         """Judge frames `[n, T, H, W, 3]` by the task; a reward sums distances up to success."""
         number, length = frames.shape[:2]
         rewards, distance = np.zeros(number), np.zeros(number)
         success, states = np.zeros(number, np.bool_), dict[str, NDArray[Any]]()
         if self._estimator is not None:
-            seen = self._estimator.read(_video(frames.reshape(-1, *self._shape)))
+            seen = self._estimator.read(as_clip(frames.reshape(-1, *self._shape)))
             states = {n: v.reshape(number, length, *v.shape[1:]) for n, v in seen.states.items()}
             masks = seen.masks.reshape(number, length, *seen.masks.shape[1:])
-            for row, place in enumerate(self._places[k] for k in which):
-                if self.task is None or place.goal is None:
+            for row, state in enumerate(self._states[k] for k in which):
+                if self.task is None or state.goal is None:
                     continue
                 own = Observation(masks[row], {n: v[row] for n, v in states.items()})
-                success[row], rewards[row] = _judge(self.task, own, place)
-                distance[row] = place.distance
-        failed = np.array([self._places[k].failed for k in which])
+                success[row], rewards[row] = _judge_episode(self.task, own, state)
+                distance[row] = state.distance
+        failed = np.array([self._states[k].failed for k in which])
         last = {name: values[:, -1] for name, values in states.items()}
-        return Seen(frames[:, -1], rewards, success, failed, distance, last)
+        return StepResult(frames[:, -1], rewards, success, failed, distance, last)
 
 
 def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[Actions]]:
@@ -267,20 +270,15 @@ def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[
     )
 
 
-def _judge(task: Task, seen: Observation, place: _Place) -> tuple[bool, float]:
+def _judge_episode(task: Task, seen: Observation, state: _EpisodeState) -> tuple[bool, float]:
     """Whether a step succeeds, and minus the sum of its distances up to then."""
-    assert place.goal is not None
-    reward, asked = 0.0, ("distance", "success", "failed")
-    told = (judged(task, each, seen, place.goal) for each in asked)
-    for distance, solved, failed in zip(*told, strict=True):
-        place.distance = float(distance) if np.isfinite(distance) else place.distance
-        place.failed = place.failed or bool(failed)
-        reward -= place.distance
-        if solved and not place.failed:
+    assert state.goal is not None
+    reward, names = 0.0, ("distance", "success", "failed")
+    judgements = (judged(task, name, seen, state.goal) for name in names)
+    for distance, solved, failed in zip(*judgements, strict=True):
+        state.distance = float(distance) if np.isfinite(distance) else state.distance
+        state.failed = state.failed or bool(failed)
+        reward -= state.distance
+        if solved and not state.failed:
             return True, reward
     return False, reward
-
-
-def _video(frames: Frames) -> torch.Tensor:
-    """Convert frames `[T, H, W, 3]` to `[T, 3, H, W]` in [0, 1]."""
-    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 255

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import ActionError, RecipeError
-from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
+from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
 
 class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
@@ -61,9 +61,9 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         """
         super().reset(seed=seed)
         start = self._dreams.start(self.np_random, options or {})
-        seen = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])
-        self._steps, self._frame = 0, seen.frames[0]
-        info = self._info(seen)
+        result = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])
+        self._steps, self._frame = 0, result.frames[0]
+        info = self._info(result)
         return self._frame, info if start.goal is None else {**info, "goal": start.goal}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Frames, float, bool, bool, dict[str, Any]]:
@@ -75,10 +75,11 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         """
         if self._steps < 0:
             raise ActionError("call reset() before step()")
-        seen = self._dreams.step([0], np.asarray(action, np.float32)[None])
-        self._steps, self._frame = self._steps + 1, seen.frames[0]
+        result = self._dreams.step([0], np.asarray(action, np.float32)[None])
+        self._steps, self._frame = self._steps + 1, result.frames[0]
         over = self._steps >= self._dreams.max_steps
-        return self._frame, float(seen.rewards[0]), bool(seen.success[0]), over, self._info(seen)
+        reward, success = float(result.rewards[0]), bool(result.success[0])
+        return self._frame, reward, success, over, self._info(result)
 
     def render(self) -> Frames:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
@@ -88,9 +89,10 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         """Free all resources."""
         self._dreams.starts.close()
 
-    def _info(self, seen: Seen) -> dict[str, Any]:
-        info: dict[str, Any] = {"state": {name: values[0] for name, values in seen.states.items()}}
+    def _info(self, result: StepResult) -> dict[str, Any]:
+        state = {name: values[0] for name, values in result.states.items()}
+        info: dict[str, Any] = {"state": state}
         if self._dreams.task is not None:
-            info |= {"distance": float(seen.distance[0]), "success": bool(seen.success[0])}
-            info["failed"] = bool(seen.failed[0])
+            info |= {"distance": float(result.distance[0]), "success": bool(result.success[0])}
+            info["failed"] = bool(result.failed[0])
         return info

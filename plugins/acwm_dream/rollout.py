@@ -28,6 +28,7 @@ from acwm_core.errors import (
     suggest,
 )
 from acwm_core.evaluation import videos
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import check_actions, choose_device
 from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
@@ -97,34 +98,35 @@ def rollout_run(
         raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     bundle = load_run(run)
     given, rows, truth = None, None, None
-    known = bundle.world_model.context_frames
+    context = bundle.world_model.context_frames
     if actions is None or image is None:
-        place = data or bundle.recipe.data["path"]
-        if data or ":" in str(place) or (Path(place) / CARD).exists():
-            truth, rows = _recorded(EpisodeDataset(place, split), episode, bundle.card)
+        folder = data or bundle.recipe.data["path"]
+        if data or ":" in str(folder) or (Path(folder) / CARD).exists():
+            truth, rows = _read_episode(EpisodeDataset(folder, split), episode, bundle.card)
         else:
-            truth, rows = _simulated(
+            truth, rows = _simulate_episode(
                 DatasetCard.read(RunFolder(find_run(run)).card), split, episode
             )
-        given = truth[:known]
-        if len(truth) <= known:
-            raise DataError(f"episode {episode} has {len(truth)} frames, and {known} are given")
+        given = truth[:context]
+        if len(truth) <= context:
+            raise DataError(f"episode {episode} has {len(truth)} frames, and {context} are given")
     if image is not None:
-        if known > 1:
-            raise RecipeError(f"this model starts from {known} frames, and --image gives one")
+        if context > 1:
+            raise RecipeError(f"this model starts from {context} frames, and --image gives one")
         given, truth = _read_image(Path(image), bundle.card.frame_size)[None], None
     if actions is not None:
-        asked = _read_actions(Path(actions), bundle.card.action)
-        before = np.zeros((0, asked.shape[1]), np.float32) if rows is None else rows[: known - 1]
-        rows, truth = np.concatenate([before, asked]), None
+        chosen = _read_actions(Path(actions), bundle.card.action)
+        before = np.zeros((0, chosen.shape[1]), np.float32) if rows is None else rows[: context - 1]
+        rows, truth = np.concatenate([before, chosen]), None
     assert given is not None
     assert rows is not None
     model = bundle.world_model.to(choose_device(device))
     where = model.action_low.device
-    seeds, taken = [seed], torch.tensor(rows)[None].to(where)
+    seeds, inputs = [seed], torch.tensor(rows)[None].to(where)
     check_pixels(given)
-    model.checked(taken[:, :-1])
-    chunks = model.rollout_chunks(given[None].to(where), taken, mode=mode, steps=steps, seeds=seeds)
+    model.checked(inputs[:, :-1])
+    start = given[None].to(where)
+    chunks = model.rollout_chunks(start, inputs, mode=mode, steps=steps, seeds=seeds)
     _write(out, _frames(chunks, truth), len(rows), bundle.card)
     return out
 
@@ -153,8 +155,8 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
         joined = (videos.join(frame, axis=1) for frame in frames)
         write_mp4(out, joined, card.fps, scale)
     else:
-        wanted = strip_frames(count)
-        kept = [frame for index, frame in enumerate(frames) if index in wanted]
+        numbers = strip_frames(count)
+        kept = [frame for index, frame in enumerate(frames) if index in numbers]
         strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
         with written_whole(out) as partial:
             Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
@@ -172,7 +174,7 @@ def strip_frames(frames: int) -> list[int]:
     return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
 
 
-def _recorded(
+def _read_episode(
     dataset: EpisodeDataset, episode: int, card: EnvironmentCard
 ) -> tuple[Clip, NDArray[np.float32]]:
     check_actions(dataset, card)
@@ -184,15 +186,17 @@ def _recorded(
     return torch.tensor(dataset.video(episode)).float() / 255, dataset.actions(episode)
 
 
-def _simulated(card: DatasetCard, split: Split, episode: int) -> tuple[Clip, NDArray[np.float32]]:
+def _simulate_episode(
+    card: DatasetCard, split: Split, episode: int
+) -> tuple[Clip, NDArray[np.float32]]:
     """Simulate the episode that the dataset would contain."""
     if episode < 0:
         raise DataError(f"episode {episode}: give 0 or more")
     name = card.environment.name
     if card.source or name not in catalog().registry("environment"):
         raise DataError(f"no simulator of {name} is installed: give a dataset of it by --data")
-    made = simulate(make_environment(name, card.options), card.spec(split, episode))
-    return torch.tensor(made.video).permute(0, 3, 1, 2).float() / 255, made.actions
+    simulated = simulate(make_environment(name, card.options), card.spec(split, episode))
+    return as_clip(simulated.video), simulated.actions
 
 
 def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:

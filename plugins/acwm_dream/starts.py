@@ -61,7 +61,7 @@ class SimulatorStarts(Starts):
         self._environment = self._inner if task is None else TaskEnvironment(self._inner, task)
 
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """See `Starts.draw`. The options are those of `Environment.reset`."""
+        """The options are those of `Environment.reset`."""
         with noting("when a dream begins", self._inner):
             seed = int(rng.integers(2**31))
             frame, info = self._environment.reset(seed=seed, options=dict(options))
@@ -74,7 +74,6 @@ class SimulatorStarts(Starts):
         return Start(np.stack(frames), between, info.get("goal"))
 
     def close(self) -> None:
-        """See `Starts.close`."""
         self._inner.close()
 
 
@@ -94,7 +93,7 @@ class DatasetStarts(Starts):
         self._episodes, self._given = episodes, given
 
     def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """See `Starts.draw`. The option ``{"episode": number}`` selects an episode."""
+        """The option ``{"episode": number}`` selects an episode."""
         number = options.get("episode", int(rng.integers(len(self._episodes))))
         if not isinstance(number, int) or not 0 <= number < len(self._episodes):
             raise RecipeError(f"episode={number!r}: give 0 to {len(self._episodes) - 1}")
@@ -114,10 +113,10 @@ def check_options(options: Mapping[str, Any], starts: Starts) -> None:
     Raises:
         RecipeError: an option is unknown; suggests the closest name.
     """
-    known = ("frame", "goal", *starts.options)
+    names = ("frame", "goal", *starts.options)
     for name in options:
-        if name not in known:
-            raise RecipeError(f"unknown option {name!r} of reset{suggest(name, known)}")
+        if name not in names:
+            raise RecipeError(f"unknown option {name!r} of reset{suggest(name, names)}")
 
 
 def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | None) -> Start:
@@ -126,11 +125,11 @@ def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | No
     Raises:
         RecipeError: the picture is not a uint8 frame of the right size.
     """
-    wanted = (*card.frame_size, 3)
+    shape = (*card.frame_size, 3)
     picture = np.asarray(frame)
-    if picture.shape != wanted or picture.dtype != np.uint8:
+    if picture.shape != shape or picture.dtype != np.uint8:
         raise RecipeError(
-            f"the frame to start from is uint8 {list(wanted)}, not {picture.dtype} "
+            f"the frame to start from is uint8 {list(shape)}, not {picture.dtype} "
             f"{list(picture.shape)}"
         )
     low, high = card.action.low, card.action.high

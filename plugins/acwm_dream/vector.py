@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from acwm_core.errors import ActionError, RecipeError
-from acwm_dream.dreams import Dreams, Frames, Seen, settings_of, spaces_of
+from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
 
 class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArray[Any]]):
@@ -78,16 +78,16 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
             raise ActionError(f"actions are {self.action_space.shape}, not {rows.shape}")
-        anew, on = (np.flatnonzero(each).tolist() for each in (self._over, ~self._over))
+        ended, running = (np.flatnonzero(each).tolist() for each in (self._over, ~self._over))
         rewards, solved = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         info: dict[str, Any] = {}
-        if on:
-            seen = self._dreams.step(on, rows[on])
-            self._steps[on] += 1
-            rewards[on], solved[on] = seen.rewards, seen.success
-            self._show(on, seen, info)
-        if anew:
-            self._begin(anew, {}, info)
+        if running:
+            result = self._dreams.step(running, rows[running])
+            self._steps[running] += 1
+            rewards[running], solved[running] = result.rewards, result.success
+            self._show(running, result, info)
+        if ended:
+            self._begin(ended, {}, info)
         late = self._steps >= self._dreams.max_steps
         self._over = solved | late
         return self._frames.copy(), rewards, solved, late, info
@@ -107,12 +107,12 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
             goals[:] = [start.goal for start in starts]
             self._fill(info, "goal", which, goals)
 
-    def _show(self, which: list[int], seen: Seen, info: dict[str, Any]) -> None:
-        self._frames[which] = seen.frames
+    def _show(self, which: list[int], result: StepResult, info: dict[str, Any]) -> None:
+        self._frames[which] = result.frames
         if self._dreams.task is not None:
             for name in ("distance", "success", "failed"):
-                self._fill(info, name, which, getattr(seen, name))
-        for name, values in seen.states.items():
+                self._fill(info, name, which, getattr(result, name))
+        for name, values in result.states.items():
             self._fill(info.setdefault("state", {}), name, which, values)
 
     def _fill(

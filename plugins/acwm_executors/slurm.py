@@ -225,16 +225,16 @@ class SlurmExecutor(BatchExecutor):
         """
         files = sorted(self.folder.glob("*.job"))
         queue = _queue() if files else {}
-        found: dict[str, JobState] = {}
+        states: dict[str, JobState] = {}
         for file in files:
             job, _, log = file.read_text("utf-8").partition(" ")
             if job in queue:
                 state = "running" if queue[job] else "queued"
             else:
-                began = Path(log).exists() and Path(log).stat().st_mtime >= file.stat().st_mtime
-                state = "failed" if began else "ended"
-            found[file.stem] = JobState(job, state)
-        return found
+                started = Path(log).exists() and Path(log).stat().st_mtime >= file.stat().st_mtime
+                state = "failed" if started else "ended"
+            states[file.stem] = JobState(job, state)
+        return states
 
 
 def _queue() -> dict[str, bool]:
@@ -244,10 +244,10 @@ def _queue() -> dict[str, bool]:
         DataError: SLURM does not answer.
     """
     command = ["squeue", "--me", "--noheader", "--format=%F %T"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    if found.returncode:
-        raise DataError(f"squeue does not answer: {found.stderr.strip()}")
-    states = [line.strip().partition(" ") for line in found.stdout.splitlines()]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise DataError(f"squeue does not answer: {process.stderr.strip()}")
+    states = [line.strip().partition(" ") for line in process.stdout.splitlines()]
     return {job: state == "RUNNING" for job, _, state in states if job}
 
 
@@ -260,7 +260,7 @@ def _run_tasks(
     function: Callable[[Any, Report], Any], tasks: Mapping[int, Any], folder: Path
 ) -> dict[int, Any]:
     """The result of the function for each task of an element, or the exception it raised."""
-    found: dict[int, Any] = {}
+    results: dict[int, Any] = {}
     for index, task in tasks.items():
         with (folder / f"units-{index}").open("wb", buffering=0) as done:
 
@@ -268,10 +268,10 @@ def _run_tasks(
                 done.write(b"." * units)
 
             try:
-                found[index] = function(task, report)
+                results[index] = function(task, report)
             except Exception as error:
-                found[index] = error
-    return found
+                results[index] = error
+    return results
 
 
 def _become(command: Sequence[str]) -> None:
