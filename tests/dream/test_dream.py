@@ -222,6 +222,6 @@ def test_a_world_without_an_estimator_has_no_tasks_in_a_dream(tmp_path):
 def test_a_model_that_cannot_be_streamed_is_refused(tmp_path):
     run = tiny.make_run(tmp_path)
     with pytest.raises(
-        RecipeError, match="cannot be used as an environment: this LinearModel looks at later"
+        RecipeError, match="cannot be used as an environment: a model trained with FullSequence"
     ):
         dream(run, None)

@@ -257,7 +257,7 @@ def test_a_file_of_the_codec_that_could_run_code_does_not_ship(run, tmp_path):
     recipe.codec.params["weights"] = str(tmp_path / "weights.pt")
     (tmp_path / "weights.pt").write_bytes(b"pickled")
     with pytest.raises(TrainingError, match=r"weights\.pt is not a safetensors file, so it cannot"):
-        packing._own(recipe, tmp_path)
+        packing._portable_recipe(recipe, tmp_path)
 
 
 def test_it_does_not_fix_the_number_of_threads(packed):
