@@ -32,9 +32,6 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
 
     Attributes:
         repeat: video frames per step.
-
-    Raises:
-        AcwmError: the dream cannot be created; see `Dreams`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (as Gymnasium declares it)
@@ -54,11 +51,7 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frames, dict[str, Any]]:
-        """Start an episode.
-
-        Raises:
-            RecipeError, DataError: the requested start is not possible.
-        """
+        """Start an episode."""
         super().reset(seed=seed)
         start = self._dreams.start(self.np_random, options or {})
         result = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])

@@ -25,9 +25,6 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
     Args:
         num_envs: number of episodes.
         **settings: see `DreamSettings`.
-
-    Raises:
-        AcwmError: the dreams cannot be created; see `Dreams`.
     """
 
     def __init__(self, *, num_envs: int = 1, **settings: Any) -> None:

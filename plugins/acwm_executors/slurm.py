@@ -218,11 +218,7 @@ class SlurmExecutor(BatchExecutor):
         return submitted.job_id
 
     def states(self) -> Mapping[str, JobState]:
-        """The state of the last job of each name; a job that started and ended counts as failed.
-
-        Raises:
-            DataError: SLURM does not answer.
-        """
+        """The state of the last job of each name; a job that started and ended counts as failed."""
         files = sorted(self.folder.glob("*.job"))
         queue = _queue() if files else {}
         states: dict[str, JobState] = {}

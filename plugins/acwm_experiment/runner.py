@@ -75,11 +75,6 @@ def submit_experiment(
 
     Returns:
         The number of new jobs.
-
-    Raises:
-        DataError: a job is refused, or another command is running the experiment.
-        TrainingError: a folder holds another run.
-        RecipeError: the executor is not a batch system, or cannot work here.
     """
     queue = _queue(plan.folder / "jobs" / executor, options)
     with _locked_folder(plan, all_steps(plan)) as todo:
@@ -134,12 +129,7 @@ def _locked_folder(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[lis
 
 
 def overview(plan: ExperimentPlan) -> Iterator[str]:
-    """Lines on the progress of an experiment: one per step and a summary. Changes nothing.
-
-    Raises:
-        DataError: a batch system does not answer.
-        TrainingError: a folder holds another run.
-    """
+    """Lines on the progress of an experiment: one per step and a summary. Changes nothing."""
     steps = all_steps(plan)
     progress, jobs = all_progress(steps, plan), _jobs(plan)
     busy = plan.folder.is_dir()  # whether a command on this or another machine runs the experiment

@@ -94,19 +94,11 @@ def print_table(table: Sequence[RowSummary]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from acwm_planning.table import HEADS
+
     shown = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    heads = ("", "success", "95 %", "p", "final distance", "s / decision", "rollouts / decision")
-    for head in heads:
+    for head in HEADS:
         shown.add_column(head, justify="left" if not head else "right", overflow="fold")
     for row in table:
-        low, high = 100 * (row.success.low or 0), 100 * (row.success.high or 0)
-        shown.add_row(
-            row.row,
-            f"{row.successes}/{row.episodes}",
-            f"{low:.0f} to {high:.0f} %",
-            "" if row.p is None else f"{row.p:.2g}",
-            f"{row.distance.value:.3g} of {row.start_distance:.3g}",
-            "" if row.seconds_per_decision is None else f"{row.seconds_per_decision:.2g}",
-            "" if row.rollouts_per_decision is None else f"{row.rollouts_per_decision:.0f}",
-        )
+        shown.add_row(*row.cells())
     Console(highlight=False, markup=False).print(shown)

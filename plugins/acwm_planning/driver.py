@@ -32,9 +32,6 @@ class PlanningDriver(Driver):
         task: the task to solve.
         usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
         steps: sampling steps; those of the task's settings, or the model's own, by default.
-
-    Raises:
-        RecipeError, DataError, MissingExtraError: a component cannot be created.
     """
 
     def __init__(

@@ -94,12 +94,7 @@ class EpisodeResult:
 
 
 def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> EpisodeResult:
-    """Play an episode until its task is solved or its time is over.
-
-    Raises:
-        RecipeError: the episode has no goal, or the controller cannot act in it.
-        ActionError: an action is out of bounds.
-    """
+    """Play an episode until its task is solved or its time is over."""
     parts = environment.environment, environment.task, controller
     with noting(f"in episode {spec.index} of {spec.split}", *parts):
         frame, info = environment.reset(options={"spec": spec})

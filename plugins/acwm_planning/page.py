@@ -11,7 +11,7 @@ from jinja2 import Environment, select_autoescape
 from acwm_core.files import writing, written_whole
 from acwm_core.recipe.types import show
 from acwm_planning.settings import ROW_NAMES
-from acwm_planning.table import VIDEOS, RowSummary
+from acwm_planning.table import HEADS, VIDEOS, RowSummary
 
 PAGE_FILE = "index.html"
 
@@ -33,14 +33,8 @@ _TEMPLATE = """<!doctype html>
 <h1>{{ title }}</h1>
 <p class="quiet">{{ settings }}</p>
 <div class="wide"><table>
-<tr><th><th>success<th>95 %<th>p<th>final distance<th>s / decision<th>rollouts / decision</tr>
-{% for row in rows %}<tr><td>{{ row.row }}
-<td>{{ row.successes }}/{{ row.episodes }}
-<td>{{ "%.0f to %.0f %%"|format(100 * row.success.low, 100 * row.success.high) }}
-<td>{{ "%.2g"|format(row.p) if row.p is not none }}
-<td>{{ "%.3g of %.3g"|format(row.distance.value, row.start_distance) }}
-<td>{{ "%.2g"|format(row.seconds_per_decision) if row.seconds_per_decision }}
-<td>{{ "%.0f"|format(row.rollouts_per_decision) if row.rollouts_per_decision }}</tr>
+<tr>{% for head in heads %}<th>{{ head }}{% endfor %}</tr>
+{% for row in rows %}<tr><td>{{ row.cells()|join("\n<td>"|safe) }}</tr>
 {% endfor %}</table></div>
 <p class="quiet">Intervals are exact (Clopper and Pearson), p is of McNemar's test against the first
 row, on the same episodes; distances are means in the end and at the start.</p>
@@ -69,9 +63,8 @@ def write_page(
             name = f"{VIDEOS}/{file.name}"
             videos.append({"file": name, "row": row, "seed": seed, "panels": panels})
     template = Environment(autoescape=select_autoescape(default=True)).from_string(_TEMPLATE)
-    text = template.render(
-        title=title, settings=" ".join(_words(settings)), rows=rows, videos=videos
-    )
+    words = " ".join(_words(settings))
+    text = template.render(title=title, settings=words, heads=HEADS, rows=rows, videos=videos)
     page = folder / PAGE_FILE
     with writing(page), written_whole(page) as partial:
         partial.write_text(text, encoding="utf-8")

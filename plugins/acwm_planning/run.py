@@ -45,10 +45,6 @@ class EpisodePlayer:
         settings: settings of planning.
         device: device of the model; ``"auto"`` takes a GPU if there is one.
         usual: see `PlanningController`.
-
-    Raises:
-        UnknownNameError: there is no such task.
-        RecipeError, DataError, MissingExtraError: a component cannot be created.
     """
 
     def __init__(
@@ -71,11 +67,7 @@ class EpisodePlayer:
         self._estimator = estimator_for(self.card) if settings.estimates else None
 
     def play(self, row: str, seed: int) -> tuple[EpisodeResult, Controller]:
-        """Play one episode; returns it with the controller that acted.
-
-        Raises:
-            RecipeError: the row is not available here, or cannot be planned.
-        """
+        """Play one episode; returns it with the controller that acted."""
         controller = self.controller(row)
         return play(self.environment, spec_of_seed(self.card, seed), controller), controller
 
@@ -143,22 +135,13 @@ def _create(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
 
 
 def declared_settings(run: str | Path, task: str) -> tuple[str, ...]:
-    """The settings that a task of a run's environment declares; see `Task.planning`.
-
-    Raises:
-        UnknownNameError: there is no such task.
-        DataError: the run has no readable card.
-    """
+    """The settings that a task of a run's environment declares; see `Task.planning`."""
     name = DatasetCard.read(RunFolder(find_run(run)).card).environment.name
     return catalog().component("environment", name).load_task(task).planning
 
 
 def usual_actions(run: Path) -> list[float] | None:
-    """Standard deviation `[A]` of the raw actions that a model was trained on; None if unknown.
-
-    Raises:
-        DataError: the run has no readable card.
-    """
+    """Standard deviation `[A]` of the raw actions that a model was trained on; None if unknown."""
     statistics = DatasetCard.read(RunFolder(run).card).actions.get("train")
     return None if statistics is None else [*statistics["std"]]
 
@@ -190,9 +173,6 @@ def plan_episodes(
 
     Returns:
         The table of all episodes in `out`.
-
-    Raises:
-        AcwmError: the episodes cannot be played; see `EpisodePlayer` and `ResumableResults`.
     """
     weights = RunFolder(run).weights
     player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))

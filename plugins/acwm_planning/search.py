@@ -139,7 +139,6 @@ class SearchPlanner(Planner):
         """See `Planner.plan`.
 
         Raises:
-            ShapeError: see `Search`.
             RecipeError: no candidate has a finite cost.
         """
         before = self._resting(len(low)) if self.interpolation == "linear" else None

@@ -29,6 +29,10 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
     return path
 
 
+HEADS = ("", "success", "95 %", "p", "final distance", "s / decision", "rollouts / decision")
+"""Heads of the columns in which a table is shown."""
+
+
 @dataclass(frozen=True)
 class RowSummary:
     """One row of the table."""
@@ -45,6 +49,19 @@ class RowSummary:
     p: float | None
     seconds_per_decision: float | None
     rollouts_per_decision: float | None
+
+    def cells(self) -> tuple[str, ...]:
+        """The row as text, under `HEADS`."""
+        low, high = 100 * (self.success.low or 0), 100 * (self.success.high or 0)
+        return (
+            self.row,
+            f"{self.successes}/{self.episodes}",
+            f"{low:.0f} to {high:.0f} %",
+            "" if self.p is None else f"{self.p:.2g}",
+            f"{self.distance.value:.3g} of {self.start_distance:.3g}",
+            "" if self.seconds_per_decision is None else f"{self.seconds_per_decision:.2g}",
+            "" if self.rollouts_per_decision is None else f"{self.rollouts_per_decision:.0f}",
+        )
 
 
 def summarise(lines: Sequence[Line]) -> list[RowSummary]:

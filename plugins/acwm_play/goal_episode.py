@@ -54,11 +54,7 @@ class GoalEpisode:
         self._decisions = 0
 
     async def ready(self, wake: asyncio.Event) -> bool:
-        """Whether the next action is known; if not, wait until it is, or until `wake` is set.
-
-        Raises:
-            AcwmError: there is no goal, or the driver failed.
-        """
+        """Whether the next action is known; if not, wait until it is, or until `wake` is set."""
         if self.solved or self._plan:
             return True
         decision = self._decision = self._decision or self._start_decision()

@@ -54,11 +54,7 @@ class LiveWorld:
 
     @classmethod
     async def create(cls, world: World, workers: Workers) -> LiveWorld:
-        """Load everything that a world needs.
-
-        Raises:
-            AcwmError: something cannot be loaded.
-        """
+        """Load everything that a world needs."""
         simulator = await SimulatorProcess.launch(world.environment, world.size)
         card = simulator.card
         try:
@@ -73,11 +69,7 @@ class LiveWorld:
         return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, model.given)))
 
     async def begin(self, scene: Scene) -> tuple[TimeStep, NDArray[np.uint8]]:
-        """Start a scene; returns the simulator's time step and the model's picture of it.
-
-        Raises:
-            AcwmError: a factor does not have this value, or the simulator failed.
-        """
+        """Start a scene; returns the simulator's time step and the model's picture of it."""
         time_steps = await self.simulator.start(scene, self.model.given)
         self.recent.clear()
         self.recent.extend(time_steps)

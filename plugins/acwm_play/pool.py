@@ -34,19 +34,11 @@ class WorldPool:
         return [(name, world.environment) for name, world in self.worlds.items()]
 
     async def warm_up(self) -> None:
-        """Set up the first world, so that its errors are reported before the page is served.
-
-        Raises:
-            AcwmError: the world cannot be played.
-        """
+        """Set up the first world, so that its errors are reported before the page is served."""
         self._spare = await LiveWorld.create(next(iter(self.worlds.values())), self.workers)
 
     async def acquire(self, world: World) -> LiveWorld:
-        """A running world, for one session.
-
-        Raises:
-            AcwmError: the world cannot be played.
-        """
+        """A running world, for one session."""
         spare = self._spare
         if spare is not None and spare.world == world and spare.simulator.alive:
             self._spare = None

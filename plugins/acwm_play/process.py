@@ -48,11 +48,7 @@ class SimulatorProcess:
 
     @classmethod
     async def launch(cls, environment: str, size: tuple[int, int]) -> SimulatorProcess:
-        """Start the process and wait until it is ready.
-
-        Raises:
-            AcwmError: the environment cannot be created.
-        """
+        """Start the process and wait until it is ready."""
         process = cls(environment, size)
         try:
             process.card, process.pointing = await process._do(process._begin)

@@ -172,11 +172,7 @@ def serve(
     port: int | None = None,
     browser: bool = True,
 ) -> None:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        AcwmError: the port is taken, or the first world cannot be played.
-    """
+    """Serve the page until Ctrl-C."""
     pool = WorldPool(worlds, steps)
     server = Server(pool, out, token())
     with contextlib.suppress(KeyboardInterrupt):

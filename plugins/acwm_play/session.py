@@ -201,11 +201,7 @@ class Session:
         self._predicting = asyncio.create_task(self._predict(live, time_steps, seqs))
 
     async def _end_prediction(self) -> None:
-        """Wait until the running prediction has ended.
-
-        Raises:
-            AcwmError: the model failed.
-        """
+        """Wait until the running prediction has ended."""
         task, self._predicting = self._predicting, None
         if task is not None:
             await task

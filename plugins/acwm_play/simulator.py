@@ -100,11 +100,7 @@ class Simulator:
         self._solved = False
 
     def start(self, scene: Scene, frames: int = 1) -> list[TimeStep]:
-        """Build a scene and hold still for `frames` frames, as many as a model is given.
-
-        Raises:
-            RecipeError: the environment does not have such a factor or value.
-        """
+        """Build a scene and hold still for `frames` frames, as many as a model is given."""
         spec = EpisodeSpec(self.card.name, "train", scene.index, factors=dict(scene.factors))
         with noting(f"in scene {scene.index}", self.environment):
             frame, info = self.environment.reset(options={"spec": spec})

@@ -14,11 +14,12 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Task
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
+from acwm_core.training.run import load_run
 from acwm_core.training.trained import find_run
 from acwm_planning.planner import Driver
 from acwm_planning.run import usual_actions
 from acwm_play.live_model import LiveModel
-from acwm_play.worlds import World, load
+from acwm_play.worlds import World
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -48,19 +49,11 @@ class Workers:
         return await loop.run_in_executor(pool, lambda: work(*args, **more))
 
     def live_model(self, world: World, card: EnvironmentCard) -> LiveModel:
-        """Create a stream of a world's model.
-
-        Raises:
-            AcwmError: the model cannot be loaded, or cannot be played in this environment.
-        """
+        """Create a stream of a world's model."""
         return LiveModel(self._model("model", world), card, self._steps)
 
     def driver(self, name: str, world: World, card: EnvironmentCard, task: Task) -> Driver:
-        """Create a driver of a world, with a copy of its model, because both work at once.
-
-        Raises:
-            AcwmError: the model cannot be loaded, or the driver cannot be created.
-        """
+        """Create a driver of a world, with a copy of its model, because both work at once."""
         return (
             catalog()
             .component("driver", name)
@@ -77,7 +70,7 @@ class Workers:
     def _model(self, thread: ThreadName, world: World) -> WorldModel:
         key = thread, str(world.run)
         if key not in self._models:
-            self._models[key] = load(world).world_model
+            self._models[key] = load_run(world.run).world_model
         return self._models[key]
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.env.task import Task
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.plugins import catalog
-from acwm_core.training.run import RunBundle, RunFolder, load_run
+from acwm_core.training.run import RunFolder
 from acwm_core.training.trained import find_run, trained_models
 
 
@@ -76,15 +76,6 @@ def playable(
     return [
         dataclasses.replace(world, name=name) for name, world in _by_unique_name(worlds).items()
     ]
-
-
-def load(world: World) -> RunBundle:
-    """Load the run of a world: its model and the card of its training data.
-
-    Raises:
-        TrainingError: the run cannot be read.
-    """
-    return load_run(world.run)
 
 
 def tasks_of(environment: str) -> dict[str, Task]:

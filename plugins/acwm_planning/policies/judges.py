@@ -171,11 +171,7 @@ class ModelJudge(Judge):
         ]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """The policy decides once per latent frame.
-
-        Raises:
-            RecipeError: the model cannot be streamed.
-        """
+        """The policy decides once per latent frame."""
         between = torch.from_numpy(start.actions)[None].to(self._device)
         stream = self._world.stream(
             self._given(start), between, steps=self._steps, seeds=[start.spec.index]

@@ -155,9 +155,6 @@ def rank_policies(
         steps: sampling steps of the model; its own number by default.
         device: device of the model.
         progress: show a progress bar.
-
-    Raises:
-        AcwmError: the policies cannot be rolled out or ranked.
     """
     bundle, weights = load_run(run), file_sha256(RunFolder(find_run(run)).weights)
     goal_task: Task = catalog().component("environment", bundle.card.name).load_task(task)

@@ -17,6 +17,7 @@ from typing import Any
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.files import made_whole, writing
+from acwm_core.training.run import load_run
 from acwm_play.about import about_world, places
 from acwm_play.export.episodes import EPISODE_COUNT, RecordedEpisode, maps, record
 from acwm_play.export.graphs import check, export_graphs
@@ -24,7 +25,7 @@ from acwm_play.export.runtime import runtime
 from acwm_play.layout import Pointing, controls, physics_of
 from acwm_play.live_model import LiveModel
 from acwm_play.simulator import Simulator
-from acwm_play.worlds import World, load
+from acwm_play.worlds import World
 
 PAGE = Path(__file__).parents[1] / "page"
 
@@ -48,13 +49,10 @@ def export(world: World, folder: Path, package: Path | None = None) -> Path:
 
     Returns:
         The file to open.
-
-    Raises:
-        AcwmError: the model cannot be exported, or something needed for it is missing.
     """
     if folder.exists() and any(folder.iterdir()):
         raise RecipeError(f"{folder} is not empty: name a new folder")
-    model = load(world).world_model
+    model = load_run(world.run).world_model
     simulator = Simulator(world.environment, world.size)
     try:
         live = LiveModel(model, simulator.card, None)
