@@ -142,8 +142,8 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
                 "a lower training.learning_rate"
             )
         true = None if truth is None else truth[start : start + len(clip)]
-        shown = [videos.to_pixels(clip)] if true is None else videos.panels(true, clip)
-        yield from zip(*shown, strict=True)
+        parts = [videos.to_pixels(clip)] if true is None else videos.panels(true, clip)
+        yield from zip(*parts, strict=True)
         start += len(clip)
 
 
@@ -156,16 +156,16 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
         write_mp4(out, joined, card.fps, scale)
     else:
         numbers = strip_frames(count)
-        kept = [frame for index, frame in enumerate(frames) if index in numbers]
-        strip = frame_strip([np.stack(panel) for panel in zip(*kept, strict=True)])
+        selection = [frame for index, frame in enumerate(frames) if index in numbers]
+        strip = frame_strip([np.stack(panel) for panel in zip(*selection, strict=True)])
         with written_whole(out) as partial:
             Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """A picture of evenly spaced frames of a clip, with one row per panel `[T, H, W, 3]`."""
-    shown = strip_frames(len(panels[0]))
-    rows = [videos.join([panel[index] for index in shown], axis=1) for panel in panels]
+    numbers = strip_frames(len(panels[0]))
+    rows = [videos.join([panel[index] for index in numbers], axis=1) for panel in panels]
     return videos.join(rows, axis=0)
 
 

@@ -89,9 +89,9 @@ def experiment(
     if options and not executor:
         raise RecipeError(f"executor.{next(iter(options))} needs --executor")
     read = read_grid if grid else read_experiment
-    found = read(file, overrides_of_recipes, seeds)
-    folder = out or Path("experiments", found.experiment.name)
-    plan = make_plan(found, folder, runs)
+    content = read(file, overrides_of_recipes, seeds)
+    folder = out or Path("experiments", content.experiment.name)
+    plan = make_plan(content, folder, runs)
     if only_plan:
         for line in overview(plan):
             click.echo(line)

@@ -37,11 +37,11 @@ class PlannerChecks(Suite):
     def plans_actions(self) -> None:
         """Construct the planner and plan actions `[T, A]`, at least `actions_per_plan` of them."""
         expect_is_a(self._planner, Planner)
-        plan, taken = self._plan(), self._planner.actions_per_plan
+        plan, count = self._plan(), self._planner.actions_per_plan
         expect_is_a(plan, Plan)
         expect_equal("actions are", plan.actions.ndim, 2)
         expect_equal("an action has", plan.actions.shape[1], len(LOW))
-        expect(1 <= taken <= len(plan.actions), f"it takes {taken} of {len(plan.actions)} actions")
+        expect(1 <= count <= len(plan.actions), f"it takes {count} of {len(plan.actions)} actions")
         expect(plan.evaluations > 0, "it says that it asked for no cost")
 
     def actions_lie_within_their_bounds(self) -> None:
@@ -53,10 +53,10 @@ class PlannerChecks(Suite):
         """Find a plan of lower cost than three quarters of random plans."""
         plan = self._plan()
         generator = torch.Generator().manual_seed(1)
-        drawn = torch.rand(256, *plan.actions.shape, generator=generator)
-        chance = _bowl(LOW + drawn * (HIGH - LOW)).quantile(0.25).item()
-        found = _bowl(plan.actions[None]).item()
-        expect(found < chance, f"its plan costs {found:.3g}, a random one {chance:.3g}")
+        shares = torch.rand(256, *plan.actions.shape, generator=generator)
+        chance = _bowl(LOW + shares * (HIGH - LOW)).quantile(0.25).item()
+        cost = _bowl(plan.actions[None]).item()
+        expect(cost < chance, f"its plan costs {cost:.3g}, a random one {chance:.3g}")
 
     def repeats_itself(self) -> None:
         """Give the same plan again after a reset, with the same generator."""

@@ -96,9 +96,9 @@ def print_table(table: Sequence[RowSummary]) -> None:
 
     from acwm_planning.table import HEADS
 
-    shown = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for head in HEADS:
-        shown.add_column(head, justify="left" if not head else "right", overflow="fold")
+        grid.add_column(head, justify="left" if not head else "right", overflow="fold")
     for row in table:
-        shown.add_row(*row.cells())
-    Console(highlight=False, markup=False).print(shown)
+        grid.add_row(*row.cells())
+    Console(highlight=False, markup=False).print(grid)

@@ -181,13 +181,13 @@ class ModelRollouts:
             goal_cost: cost of the candidates' futures.
             seed: seed of the model's noise.
         """
-        given, taken = self._encode(history, still)
+        given, recent = self._encode(history, still)
         stills: dict[int, Latent] = {}
 
         def cost(actions: Actions) -> Tensor:
             costs: list[Tensor] = []
             for part in actions.split(self._batch):
-                futures = self._futures(given, taken, part, seed, stills)
+                futures = self._futures(given, recent, part, seed, stills)
                 # An estimator may read something from a picture that is not finite.
                 finite, readable = futures.finite.cpu(), goal_cost(futures, len(part)).cpu()
                 costs.append(torch.where(finite, readable, torch.nan))
@@ -200,10 +200,10 @@ class ModelRollouts:
         self, history: History, still: NDArray[np.float32], actions: Tensor, seed: int
     ) -> Clip:
         """Predict the video `[T, 3, H, W]` of one candidate `[T, A]`."""
-        given, taken = self._encode(history, still)
-        latents = self._predict(given, taken, actions[None], seed)
+        given, recent = self._encode(history, still)
+        latents = self._predict(given, recent, actions[None], seed)
         frames = self.world_model.codec.decode(latents)[0]
-        return frames[self._known_frames(given, taken) :][: len(actions)].cpu()
+        return frames[self._known_frames(recent) :][: len(actions)].cpu()
 
     def _encode(self, history: History, still: NDArray[np.float32]) -> tuple[Latent, Tensor]:
         """Latents of the given frames `[1, K, C, h, w]`, and the actions `[1, n, A]` up to now."""
@@ -216,30 +216,35 @@ class ModelRollouts:
         first = len(frames) - past - known
         device = world.action_low.device
         given = world.encode(as_clip(np.stack(frames[first : first + known]))[None].to(device))
-        taken = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
-        return given, torch.from_numpy(taken)
+        recent = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
+        return given, torch.from_numpy(recent)
 
     def _futures(
-        self, given: Latent, taken: Tensor, actions: Actions, seed: int, stills: dict[int, Latent]
+        self,
+        given: Latent,
+        recent: Tensor,
+        actions: Actions,
+        seed: int,
+        stills: dict[int, Latent],
     ) -> ModelFutures:
         with torch.set_grad_enabled(actions.requires_grad):
-            latents = self._predict(given, taken, actions, seed)
+            latents = self._predict(given, recent, actions, seed)
         codec = self.world_model.codec
-        now = codec.latent_frames(self._known_frames(given, taken))
+        now = codec.latent_frames(self._known_frames(recent))
         last = (actions.shape[1] - 1) % codec.temporal_stride
         before, after = latents[:, :now], latents[:, now:]
         return ModelFutures(codec, after, before, last, self._estimator, stills)
 
-    def _predict(self, given: Latent, taken: Tensor, actions: Actions, seed: int) -> Latent:
+    def _predict(self, given: Latent, recent: Tensor, actions: Actions, seed: int) -> Latent:
         """All latent frames, including the given ones, `[N, L, C, h, w]`."""
         world, number = self.world_model, len(actions)
-        rows = torch.cat([taken.expand(number, -1, -1), actions], 1).to(world.action_low.device)
+        rows = torch.cat([recent.expand(number, -1, -1), actions], 1).to(world.action_low.device)
         stride = world.codec.temporal_stride
         rows = continued(rows, -rows.shape[1] % stride)
         length = 1 + rows.shape[1] // stride
         most = world.codec.latent_frames(world.clip_frames)
         if length > most and not world.objective.streams_by_default(world.model):
-            fitting = (most - 1) * stride - taken.shape[1]
+            fitting = (most - 1) * stride - recent.shape[1]
             advice = f"plan at most {fitting} actions (planner.horizon · planner.action_block)"
             raise RecipeError(
                 f"the model was trained on clips of {world.clip_frames} frames, and this plan "
@@ -254,6 +259,6 @@ class ModelRollouts:
             world.model, given, conditioning, length, generators, self._steps
         )
 
-    def _known_frames(self, given: Latent, taken: Tensor) -> int:
+    def _known_frames(self, recent: Tensor) -> int:
         """Number of video frames from the first given one to the current one."""
-        return 1 + taken.shape[1]
+        return 1 + recent.shape[1]

@@ -85,10 +85,10 @@ class CrossEntropy(SearchPlanner):
         kept = self.kept_elites(start)
         for iteration in range(self.iterations):
             noise = self.noise((self.drawn(iteration), *start.shape), rng)
-            drawn = [(mean + deviation * noise).clamp(-1, 1), kept]
+            groups = [(mean + deviation * noise).clamp(-1, 1), kept]
             if iteration == self.iterations - 1:
-                drawn.append(mean[None])
-            candidates = torch.cat(drawn)
+                groups.append(mean[None])
+            candidates = torch.cat(groups)
             costs = search(candidates)
             best = candidates[costs.argsort(stable=True)[: self.elites]]
             # Candidates without a finite cost are not used for the fit.
@@ -258,8 +258,8 @@ def coloured_noise(shape: tuple[int, ...], colour: float, rng: torch.Generator) 
     single = torch.zeros(len(power), dtype=torch.bool)
     single[0], single[-1] = True, length % 2 == 0 or length == 1
     amplitude = (power / (power * torch.where(single, 1.0, 2.0)).sum()).sqrt() * length
-    drawn = torch.randn(2, number, size, len(power), generator=rng)
-    imaginary = torch.where(single, 0.0, drawn[1] / math.sqrt(2))
-    real = torch.where(single, drawn[0], drawn[0] / math.sqrt(2))
+    normal = torch.randn(2, number, size, len(power), generator=rng)
+    imaginary = torch.where(single, 0.0, normal[1] / math.sqrt(2))
+    real = torch.where(single, normal[0], normal[0] / math.sqrt(2))
     spectrum = torch.complex(amplitude * real, amplitude * imaginary)
     return torch.fft.irfft(spectrum, n=length).transpose(1, 2)

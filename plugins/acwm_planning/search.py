@@ -104,13 +104,13 @@ class SearchPlanner(Planner):
     ) -> None:
         at_least("horizon", horizon, 1)
         at_least("action_block", action_block, 1)
-        taken = action_block if actions_per_plan is None else actions_per_plan
-        if not 1 <= taken <= horizon * action_block:
+        count = action_block if actions_per_plan is None else actions_per_plan
+        if not 1 <= count <= horizon * action_block:
             raise RecipeError(
-                f"planner.actions_per_plan={taken}: give 1 to the {horizon * action_block} actions "
+                f"planner.actions_per_plan={count}: give 1 to the {horizon * action_block} actions "
                 "that are planned (horizon · action_block)"
             )
-        self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, taken
+        self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, count
         self.interpolation, self.warm_start = interpolation, warm_start
         self._last: Tensor | None = None
         self._rest: Tensor | None = None
@@ -181,10 +181,10 @@ class SearchPlanner(Planner):
 
     def shifted(self, blocks: Tensor) -> Tensor:
         """Blocks `[…, H, A]` without those already taken; the last one is repeated at the end."""
-        left = blocks[..., self.actions_per_plan // self.action_block :, :]
+        rest = blocks[..., self.actions_per_plan // self.action_block :, :]
         end = blocks[..., -1:, :]
-        missing = self.horizon - left.shape[-2]
-        return torch.cat([left, *[end] * missing], -2)
+        missing = self.horizon - rest.shape[-2]
+        return torch.cat([rest, *[end] * missing], -2)
 
 
 def at_least(name: str, value: float, least: float) -> None:

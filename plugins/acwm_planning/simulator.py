@@ -68,8 +68,8 @@ class SimulatorFutures(Futures):
             return seen
         latents = torch.cat([self.still(picture) for picture in pictures])
         with torch.no_grad():
-            shown = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
-        return self._estimator.read(shown.cpu())
+            reconstructions = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
+        return self._estimator.read(reconstructions.cpu())
 
     def still(self, picture: Frame) -> Latent:
         if self._codec is None:
@@ -86,12 +86,12 @@ class SimulatorFutures(Futures):
 
     def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
         """Frame and info at each of these latent frames, in order."""
-        environment, done = self._environment, 0
+        environment, step = self._environment, 0
         self._start()
         for frame in frames:
-            for action in actions[done : self._ends[frame]]:
+            for action in actions[step : self._ends[frame]]:
                 environment.advance(action)
-            done = self._ends[frame]
+            step = self._ends[frame]
             yield environment.observe()
 
     def _start(self) -> None:

@@ -104,9 +104,9 @@ def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
 
 
 def missing_episodes(
-    rows: Sequence[str], seeds: Sequence[int], done: Sequence[Line]
+    rows: Sequence[str], seeds: Sequence[int], lines: Sequence[Line]
 ) -> Iterator[tuple[str, int]]:
     """Episodes still to be played, seed by seed, so that a partial table compares all rows."""
-    finished = {(line["row"], line["seed"]) for line in done}
+    finished = {(line["row"], line["seed"]) for line in lines}
     for seed in seeds:
         yield from ((row, seed) for row in rows if (row, seed) not in finished)

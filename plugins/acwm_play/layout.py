@@ -95,8 +95,8 @@ def _along(
         if i in order or len(letters) != 1:
             continue
         step = 0.01 * np.array([np.zeros(3), AXES[letters[0]]])
-        here, there = physics.camera.to_frame(step)[:, :2]
-        way = float((there - here)[axis]) * (1, -1)[axis]  # y is down in pictures
+        origin, target = physics.camera.to_frame(step)[:, :2]
+        way = float((target - origin)[axis]) * (1, -1)[axis]  # y is down in pictures
         if abs(way) > 1.02 * best:
             best, dimension = abs(way), (i, 1 if way > 0 else -1)
     return dimension if best > 1e-4 else None

@@ -77,7 +77,7 @@ class CheckpointImporter(ABC):
         """
 
 
-def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
+def recipe_of(checkpoint: ForeignModel, overrides: Sequence[str]) -> Recipe:
     """The recipe that a checkpoint implies, changed by overrides.
 
     Raises:
@@ -85,18 +85,18 @@ def recipe_of(found: ForeignModel, overrides: Sequence[str]) -> Recipe:
         CheckpointError: an override is missing for a parameter that the checkpoint lacks.
     """
     told = with_overrides({}, overrides)
-    for name, reason in found.untold.items():
+    for name, reason in checkpoint.untold.items():
         section, _, parameter = name.partition(".")
         if parameter not in told.get(section, {}):
             raise CheckpointError(f"{reason}: add the override {name}=…")
     environment = told.get("env", {}).get("name")
-    data = {"path": f"data/{environment or 'mine'}", **found.sections.get("data", {})}
+    data = {"path": f"data/{environment or 'mine'}", **checkpoint.sections.get("data", {})}
     usual = {"evaluation": read_recipe(recipe_folder() / "base.yaml")["evaluation"]}
-    sections = merge(usual, {**found.sections, "data": data})
+    sections = merge(usual, {**checkpoint.sections, "data": data})
     return Recipe.from_dict(with_overrides(sections, overrides))
 
 
-def convert(found: ForeignModel, recipe: Recipe) -> State:
+def convert(checkpoint: ForeignModel, recipe: Recipe) -> State:
     """The weights under the names of a `WorldModel`, in float32.
 
     Raises:
@@ -104,14 +104,16 @@ def convert(found: ForeignModel, recipe: Recipe) -> State:
         PluginError: the importer's state dicts do not fit the model and conditioner.
     """
     with torch.device("meta"):
-        model = build_model(recipe.model, build_objective(recipe.objective), found.latent_channels)
+        model = build_model(
+            recipe.model, build_objective(recipe.objective), checkpoint.latent_channels
+        )
         conditioner = build_conditioner(
-            recipe.conditioner, model, found.action_size, found.temporal_stride
+            recipe.conditioner, model, checkpoint.action_size, checkpoint.temporal_stride
         )
     modules = {"model": model, "conditioner": conditioner}
     weights: State = {}
     for (prefix, module), state in zip(
-        modules.items(), found.convert(model, conditioner), strict=True
+        modules.items(), checkpoint.convert(model, conditioner), strict=True
     ):
         for name, expected in module.state_dict().items():
             if name not in state or state[name].shape != expected.shape:

@@ -64,28 +64,28 @@ def import_checkpoint(
     path, run = Path(path), RunFolder(out)
     if run.recipe.exists():
         raise TrainingError(f"{run.path} holds a run already: choose another folder")
-    found = _read_checkpoint(path, importer)
-    notes, implied = found.notes, list[str]()
-    own_codec = bool(found.codec_weights) and "codec" not in with_overrides({}, overrides)
+    checkpoint = _read_checkpoint(path, importer)
+    notes, implied = checkpoint.notes, list[str]()
+    own_codec = bool(checkpoint.codec_weights) and "codec" not in with_overrides({}, overrides)
     if own_codec:
         implied = [f"codec.weights={run.path / CODEC}"]
         notes += (f"The codec's weights came along; they are in {run.path / CODEC}.",)
-    recipe = recipe_of(found, [*implied, *overrides])
-    card = _card(recipe, found.action_size, path)
-    weights = convert(found, recipe)
+    recipe = recipe_of(checkpoint, [*implied, *overrides])
+    card = _card(recipe, checkpoint.action_size, path)
+    weights = convert(checkpoint, recipe)
     run.path.mkdir(parents=True, exist_ok=True)
     if own_codec:
-        codec = {name: tensor.contiguous() for name, tensor in found.codec_weights.items()}
+        codec = {name: tensor.contiguous() for name, tensor in checkpoint.codec_weights.items()}
         with written_whole(run.path / CODEC) as partial:
             cast(Any, safetensors.torch).save_file(codec, partial)
     reader = ["--importer", importer] if importer else []
     command = shlex.join(["acwm", "import-checkpoint", str(path), *reader, *overrides])
-    save_weights(run.weights, weights, None, found.step, imported=command)
+    save_weights(run.weights, weights, None, checkpoint.step, imported=command)
     card.write(run.path)
     with written_whole(run.recipe) as partial:  # last, because it makes the folder a run
         partial.write_text(recipe.to_yaml(), encoding="utf-8")
     parameters = sum(tensor.numel() for tensor in weights.values())
-    return Imported(run.path, recipe, found.step, parameters, notes)
+    return Imported(run.path, recipe, checkpoint.step, parameters, notes)
 
 
 def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
@@ -93,16 +93,16 @@ def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
     importers = [registry[importer]] if importer else [*registry]
     readers = [each.create_as(CheckpointImporter) for each in importers]
     content = _content(path)
-    found = [model for reader in readers if (model := reader.read(content))]
-    if len(found) > 1:
+    models = [model for reader in readers if (model := reader.read(content))]
+    if len(models) > 1:
         raise CheckpointError(f"{path} may be one of several formats: say which by --importer")
-    if not found:
+    if not models:
         names = " or ".join(each.name for each in importers)
         raise CheckpointError(
             f"{path} is not a checkpoint that {names} knows; it holds "
             f"{', '.join(map(str, list(content)[:5])) or 'nothing'}"
         )
-    return found[0]
+    return models[0]
 
 
 def _content(path: Path) -> Mapping[str, Any]:
@@ -145,16 +145,16 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
             if env is None and path == "data/mine":
                 raise _untold_actions(action_size) from None
             raise
-    found = card.environment
-    if env and env.name != found.name:
+    world = card.environment
+    if env and env.name != world.name:
         raise DataError(
-            f"{path} holds episodes of {found.name}, not of env={env.name}: leave one of the "
+            f"{path} holds episodes of {world.name}, not of env={env.name}: leave one of the "
             "overrides out"
         )
-    if found.action.size != action_size:
+    if world.action.size != action_size:
         raise DataError(
-            f"the checkpoint takes actions of size {action_size}, and those of {found.name} have "
-            f"{found.action.size}"
+            f"the checkpoint takes actions of size {action_size}, and those of {world.name} have "
+            f"{world.action.size}"
         )
     return card
 

@@ -92,10 +92,10 @@ def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESA
 
 
 def _estimate(value: float, samples: Scores) -> Estimate:
-    kept = samples[np.isfinite(samples)]
-    if math.isnan(value) or not len(kept) or len(kept) < len(samples) / 2:
+    finite = samples[np.isfinite(samples)]
+    if math.isnan(value) or not len(finite) or len(finite) < len(samples) / 2:
         return Estimate(defined(value))
-    low, high = np.quantile(kept, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.quantile(finite, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high))
 
 

@@ -70,15 +70,15 @@ def print_ranking(ranking: Ranking) -> None:
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:  # a file or a pipe has no width
         console.width = 200
-    shown = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    scores = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     heads = ("policy", "loop", "success: true", "model", "return: true", "model")
     for head in heads:
-        shown.add_column(head, justify="left" if head in ("policy", "loop") else "right")
+        scores.add_column(head, justify="left" if head in ("policy", "loop") else "right")
     for each in ranking.policies:
         success = (f"{100 * each.success[judge]:.0f} %" for judge in ("truth", "model"))
         returns = (f"{each.returns[judge]:.3g}" for judge in ("truth", "model"))
-        shown.add_row(each.policy, each.loop, *success, *returns)
-    console.print(shown)
+        scores.add_row(each.policy, each.loop, *success, *returns)
+    console.print(scores)
     console.print(f"\n{len(ranking.policies)} policies, {ranking.episodes} episodes of each")
     for each in ranking.policies:
         for judge, count in each.unread.items():

@@ -114,8 +114,8 @@ class Ranker:
         inner = self._environment.environment
         another, own = (np.concatenate([each, np.zeros_like(each[:1])]) for each in rows)
         alternatives = plan_branches(own, another, inner.still_action(), inner.card.action)
-        kept = [(each.kind, each.actions[:-1]) for each in alternatives if each.kind in BRANCHES]
-        return [("own", own[:-1]), *kept]
+        pairs = [(each.kind, each.actions[:-1]) for each in alternatives if each.kind in BRANCHES]
+        return [("own", own[:-1]), *pairs]
 
     def _decision(
         self,
@@ -210,11 +210,11 @@ def _parse_policies(
 def _roll_out(
     ranker: Ranker, results: ResumableResults, seeds: Sequence[int], progress: bool
 ) -> None:
-    done = {(str(line["policy"]), int(line["seed"])) for line in results.finished()}
-    left = {seed: [n for n in ranker.names() if (n, seed) not in done] for seed in seeds}
-    total, missing = len(seeds) * len(ranker.names()), sum(map(len, left.values()))
+    finished = {(str(line["policy"]), int(line["seed"])) for line in results.finished()}
+    missing = {seed: [n for n in ranker.names() if (n, seed) not in finished] for seed in seeds}
+    total, count = len(seeds) * len(ranker.names()), sum(map(len, missing.values()))
     what = f"ranking at {results.settings['task']}"
-    with progress_bar(what, total, done=total - missing, shown=progress) as advance:
-        for seed in (seed for seed, names in left.items() if names):
-            results.add(*ranker.lines(seed, left[seed]))
-            advance(len(left[seed]))
+    with progress_bar(what, total, done=total - count, shown=progress) as advance:
+        for seed in (seed for seed, names in missing.items() if names):
+            results.add(*ranker.lines(seed, missing[seed]))
+            advance(len(missing[seed]))

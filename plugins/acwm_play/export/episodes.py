@@ -79,8 +79,8 @@ def maps(pointing: Pointing, low: tuple[float, ...], high: tuple[float, ...]) ->
         whole = np.tile((np.array(low) + high) / 2, (len(actions), 1))
         whole[:, 2 * k : 2 * k + 2] = actions
         places = np.stack([pointing.places(row)[k] for row in whole])
-        there = _homography(places, actions)
-        homographies.append([there.tolist(), np.linalg.inv(there).tolist()])
+        forward = _homography(places, actions)
+        homographies.append([forward.tolist(), np.linalg.inv(forward).tolist()])
     return homographies
 
 
