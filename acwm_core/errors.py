@@ -99,16 +99,21 @@ class Note(str):
 
 
 @contextlib.contextmanager
-def noting(where: str, *components: object) -> Generator[None]:
+def noting(
+    where: str, *components: object, unless: type[Exception] | tuple[()] = ()
+) -> Generator[None]:
     """Add a note to every error that passes, e.g. ``"in episode 3 of train (mine.py:12)"``.
 
     Args:
         where: a phrase that begins with a preposition.
         *components: components that run in the block, or modules by name. The note names the last
             line in one of their packages.
+        unless: errors that get no note, such as an `AcwmError` that says all by itself.
     """
     try:
         yield
+    except unless:
+        raise
     except Exception as error:
         error.add_note(Note(where + _line(error, {_package(each) for each in components})))
         raise

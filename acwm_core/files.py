@@ -261,8 +261,16 @@ def parse_json(data: bytes | str) -> Any:
         ValueError: it is something else.
     """
     found = json.loads(data)
-    json.dumps(found, allow_nan=False)
+    _finite_json(found)
     return found
+
+
+def _finite_json(values: object) -> str:
+    """Turn values into JSON; `ValueError` if a number is not finite."""
+    try:
+        return json.dumps(values, allow_nan=False)
+    except ValueError as error:
+        raise ValueError("it has numbers that are not finite") from error
 
 
 def read_json(path: Path, kind: type[T], what: str) -> T:
@@ -293,7 +301,7 @@ def typed(values: Any, kind: type[T]) -> T:
     from pydantic import ValidationError
 
     try:
-        return _adapter(kind).validate_json(json.dumps(values, allow_nan=False), strict=True)
+        return _adapter(kind).validate_json(_finite_json(values), strict=True)
     except ValidationError as error:
         reason = error.errors()[0]
         where = ".".join(map(str, reason["loc"]))[:200]

@@ -26,7 +26,14 @@ from typing import Any, TypeVar, cast
 
 import pluggy
 
-from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, noting, sentence
+from acwm_core.errors import (
+    AcwmError,
+    MissingExtraError,
+    PluginError,
+    UnknownNameError,
+    noting,
+    sentence,
+)
 
 Made = TypeVar("Made")
 
@@ -190,7 +197,8 @@ class Component:
     def create(self, **params: Any) -> Any:
         """Import and construct the component; `params` override the preset `defaults`."""
         target = self.load()
-        with noting(f"in {self.part} of plugin {self.plugin!r}", target):
+        where = f"in {self.part} of plugin {self.plugin!r}"
+        with noting(where, target, unless=AcwmError):  # those of wrong parameters say all
             return target(**{**self.defaults, **params})
 
     def create_as(self, base: type[Made], **params: Any) -> Made:

@@ -105,7 +105,8 @@ def _named_if_of_others(words: Sequence[str]) -> AbstractContextManager[None]:
     command = catalog().registry("command").components().get(name) if name else None
     if command is None or command.distribution == "acwm":
         return contextlib.nullcontext()
-    return noting(f"in {command.part} of plugin {command.plugin!r}", command.target)
+    where = f"in {command.part} of plugin {command.plugin!r}"
+    return noting(where, command.target, unless=AcwmError)
 
 
 def _report(error: Exception, with_traceback: bool) -> NoReturn:

@@ -17,7 +17,7 @@ SIGNATURES = {
     "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
     "clip_frames=37, context_frames=1)",
     "build_world_model": "(recipe, card)",
-    "compose": "(recipe, overrides=())",
+    "compose": "(recipe, overrides=(), *, sections=None, trusted=None)",
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",
     "fit": "(recipe, run_dir, *, resume=None)",
     "generate": "(environment, out, *, episodes, seed=0, size=None, factors=None, exploration=0.0, "

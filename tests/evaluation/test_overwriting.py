@@ -99,7 +99,7 @@ def test_values_of_a_curve_are_not_lost(run):
 WRONG = {"provenance": {"evaluation": []}}
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, json.dumps(WRONG), "{}", "\x1b"])
+@pytest.mark.parametrize("text", [json.dumps(WRONG), "{}", "\x1b"])
 def test_a_result_that_cannot_be_read_is_worth_nothing(run, text):
     (run / FOLDER / SUMMARY).write_text(text)
     evaluate_run(run, progress=False)
