@@ -18,6 +18,7 @@ from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
+from acwm_core.training.run import load_run
 from acwm_play.export import episodes, graphs, page, runtime
 from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, export_graphs
 from acwm_play.layout import Pointing, physics_of
@@ -177,7 +178,7 @@ def written(tmp_path_factory):
             patch.setattr(page, "runtime", lambda _: dict.fromkeys(runtime.FILES, b""))
         world = playable([run])[0]
         page.export(world, folder / "page")
-    return folder / "page", page.load(world).world_model
+    return folder / "page", load_run(world.run).world_model
 
 
 LOGGED = """() => {
