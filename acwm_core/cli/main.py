@@ -72,6 +72,7 @@ class AcwmGroup(click.Group):
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
+        _warnings.clear()
         warnings.simplefilter("always", RenamedWarning)
         warnings.showwarning = _show_warning
         _print_anything()
@@ -144,14 +145,18 @@ def _refuse_a_deleted_folder() -> None:
 
 _show_any_warning = warnings.showwarning
 
+_warnings: set[str] = set()
+"""Those that this command has shown; each is told once."""
+
 
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    if issubclass(category, (AcwmWarning, RenamedWarning)):
-        click.echo(f"acwm: warning: {message!s}", err=True)
-    else:
+    if not issubclass(category, (AcwmWarning, RenamedWarning)):
         _show_any_warning(message, category, *more, **extra)
+    elif str(message) not in _warnings:
+        _warnings.add(str(message))
+        click.echo(f"acwm: warning: {message!s}", err=True)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:

@@ -70,3 +70,8 @@ def test_options(
         "acwm_core.data.generate.generate", lambda *_, **__: SimpleNamespace(splits={"train": 1})
     )
     assert said in warning(*words, "--out", str(tmp_path / "out"))
+
+
+def test_an_old_spelling_is_told_once() -> None:
+    old = Path("tests/reference/before_objectives/next_frame/recipe.yaml")
+    assert "flow" in warning("show", str(old), "flow.shift=7")
