@@ -250,6 +250,9 @@ class StateEstimator(ABC):
         for field in (each for each in self.card.state if each.name in self.fields):
             method = f"estimate ({field.name})"
             check_shape(self, method, seen.states[field.name], frames, *field.shape)
+            if np.isinf(seen.states[field.name]).any():
+                owner = type(self).__name__
+                raise PluginError(f"{owner}.{method} is infinite: give finite numbers, or NaN")
         return seen
 
     @abstractmethod

@@ -8,6 +8,7 @@ This module does not use torch.
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
@@ -187,6 +188,9 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         self._failed = self._failed or touched or bool(judged(task, "failed", seen, goal)[0])
         success = bool(judged(task, "success", seen, goal)[0]) and not self._failed
         distance = float(judged(task, "distance", seen, goal)[0])
-        if distance != distance:  # NaN; but the simulator knows every state, so this is an error
-            raise PluginError(f"the distance of task {task.name!r} is NaN in its own states")
+        if not 0 <= distance < math.inf:  # the simulator knows every state, so NaN is an error
+            raise PluginError(
+                f"the distance of task {task.name!r} is {distance} in its own states, not a finite "
+                "number of at least 0"
+            )
         info |= {"distance": distance, "success": success, "failed": self._failed}

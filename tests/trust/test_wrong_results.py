@@ -8,12 +8,14 @@ import torch
 
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
+from acwm_core.env.task import TaskEnvironment
 from acwm_core.errors import PluginError
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_planning.controllers import check_bounds
 from tests.core.tiny import SumConditioner
 from tests.evaluation import tiny
 from tests.evaluation.tiny import BlockCodec, Drift
+from tests.planning.tiny import Slide, SquareEstimator, ToPlace
 
 VIDEO = torch.zeros(1, 9, 3, 32, 32)
 
@@ -141,3 +143,24 @@ def test_environments_that_hand_out_the_same_arrays_are_recorded_truly():
     np.testing.assert_array_equal(same.video, usual.video)
     np.testing.assert_array_equal(same.masks, usual.masks)
     assert same.factors == usual.factors
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_distances_of_tasks_are_finite(value):
+    class Lost(ToPlace):
+        def distance(self, seen, goal):
+            return np.full(len(seen.masks), value)
+
+    environment = TaskEnvironment(Slide(), Lost())
+    with pytest.raises(PluginError, match="the distance of task 'place' is"):
+        environment.reset(seed=0)
+
+
+def test_what_an_estimator_reads_is_finite():
+    class Lost(SquareEstimator):
+        def estimate(self, video):
+            seen = super().estimate(video)
+            return replace(seen, states={"position": seen.states["position"] + np.inf})
+
+    with pytest.raises(PluginError, match=r"estimate \(position\) is infinite"):
+        Lost(Slide.card).read(torch.ones(3, 3, 32, 32))
