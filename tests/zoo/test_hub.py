@@ -196,7 +196,7 @@ def test_strange_names_are_one_sentence(server, tmp_path, name):
     done = invoke("rollout", "hf://org/name")
     assert done.exit_code == 2
     assert "Traceback" not in done.output
-    assert not [*tmp_path.parent.rglob("evil*")]
+    assert not [*tmp_path.parent.rglob("evil.safetensors")]
 
 
 def test_the_message_names_the_extra(run, monkeypatch):
