@@ -1,0 +1,145 @@
+"""Images of any kind as colours of 8 bits: grey, alpha, 16 bits, float, channels first, depth."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from acwm_core.errors import DataError
+
+CHANNELS = (1, 3, 4)
+"""Numbers of channels that an image has: grey or depth, colours, colours and opacity."""
+
+
+def channels_last(image: NDArray[Any]) -> NDArray[Any]:
+    """An image as ``[H, W, C]``; it may be ``[H, W]``, ``[C, H, W]`` or ``[H, W, C]``.
+
+    Raises:
+        DataError: it is no image, or could be read both ways.
+    """
+    if image.ndim == 2:
+        return image[..., None]
+    first, last = image.ndim == 3 and image.shape[0] in CHANNELS, image.shape[-1] in CHANNELS
+    if image.ndim != 3 or first == last:
+        raise DataError(f"an image is {image.shape}, not [H, W], [H, W, C] or [C, H, W]")
+    return np.moveaxis(image, 0, 2) if first else image
+
+
+def is_depth(image: NDArray[Any]) -> bool:
+    """Whether an image holds distances: one channel of more than 8 bits."""
+    return channels_last(image).shape[2] == 1 and image.dtype.itemsize > 1
+
+
+def to_rgb(
+    image: NDArray[Any],
+    *,
+    depth_range: tuple[float, float] | None = None,
+    pixel_range: tuple[float, float] | None = None,
+) -> NDArray[np.uint8]:
+    """Convert an image to ``[H, W, 3]`` uint8.
+
+    Colours with opacity are laid on black. One channel of whole numbers of more than 8 bits is depth
+    in millimetres, and one of floats is depth in metres.
+
+    Args:
+        depth_range: the distances in metres that become white and black; what is nearer or farther
+            is cut, and what was not measured (0 or not finite) is black.
+        pixel_range: the values that become black and white, for floats and 16-bit colours.
+
+    Raises:
+        DataError: it is no image, or an option is needed to read it.
+    """
+    shown = channels_last(image)
+    if is_depth(shown):
+        grey = _nearness(shown[..., 0], depth_range)
+        return np.repeat(grey[..., None], 3, axis=2)
+    if shown.dtype != np.uint8:
+        shown = _eight_bits(shown, pixel_range)
+    if shown.shape[2] == 4:
+        opacity = shown[..., 3:].astype(np.uint16)
+        shown = ((shown[..., :3] * opacity + 127) // 255).astype(np.uint8)
+    return np.repeat(shown, 3, axis=2) if shown.shape[2] == 1 else np.ascontiguousarray(shown)
+
+
+def guessed_range(image: NDArray[Any]) -> tuple[float, float] | None:
+    """The `pixel_range` of all images, judged by the first; None if they are bytes or depth.
+
+    Floats up to 1, or whole floats up to 255, speak for themselves. An image beyond the range is
+    refused later, by `to_rgb`.
+
+    Raises:
+        DataError: it cannot be told.
+    """
+    if image.dtype in (np.uint8, bool) or is_depth(image):
+        return None
+    least, most = float(image.min()), float(image.max())
+    whole = not np.any(np.asarray(image, np.float64) % 1)
+    if image.dtype.kind == "f" and least >= 0:
+        if most <= 1 and not whole:
+            return (0, 1)
+        if 1 < most <= 255 and whole:
+            return (0, 255)
+    raise _unclear(image)
+
+
+def _unclear(image: NDArray[Any]) -> DataError:
+    return DataError(
+        f"its colours are {image.dtype} from {image.min():g} to {image.max():g}: give "
+        "--pixel-range BLACK,WHITE, e.g. 0,1 or 0,255 or 0,65535"
+    )
+
+
+def _nearness(depth: NDArray[Any], span: tuple[float, float] | None) -> NDArray[np.uint8]:
+    if span is None:
+        raise DataError("it is a depth map: give --depth-range NEAR,FAR in metres")
+    metres = depth.astype(np.float32) * (1.0 if depth.dtype.kind == "f" else 1e-3)
+    near, far = span
+    measured = np.isfinite(metres) & (metres > 0)
+    share = (far - np.where(measured, metres, far)) / (far - near)
+    return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
+
+
+def _eight_bits(image: NDArray[Any], span: tuple[float, float] | None) -> NDArray[np.uint8]:
+    if image.dtype == bool:
+        return image.astype(np.uint8) * np.uint8(255)
+    if span is None:
+        raise _unclear(image)
+    black, white = span
+    if not black <= image.min() <= image.max() <= white:
+        raise DataError(
+            f"its colours reach from {image.min():g} to {image.max():g}, beyond {black:g} to "
+            f"{white:g}: give another --pixel-range"
+        )
+    return np.rint((image.astype(np.float32) - black) * (255 / (white - black))).astype(np.uint8)
+
+
+def read_image(source: Path | bytes) -> NDArray[Any]:
+    """Read a picture (PNG, JPEG, WebP, BMP, TIFF) as it is stored, upright: `to_rgb` converts it.
+
+    Raises:
+        DataError: it is missing, damaged or of another kind.
+    """
+    try:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as opened:
+            return _stored(opened)
+    except FileNotFoundError:
+        raise DataError(f"there is no {source}") from None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        what = source if isinstance(source, Path) else "an image"
+        raise DataError(f"{what} cannot be read ({error})") from error
+
+
+def _stored(opened: Image.Image) -> NDArray[Any]:
+    upright = ImageOps.exif_transpose(opened)
+    if upright.mode.startswith(("I", "F")):
+        values = np.asarray(upright)
+        return values.astype(np.uint16) if values.dtype.kind == "i" else values
+    if upright.mode in ("1", "L"):
+        return np.asarray(upright.convert("L"))
+    clear = upright.has_transparency_data
+    return np.asarray(upright.convert("RGBA" if clear else "RGB"))
