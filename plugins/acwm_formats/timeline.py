@@ -45,7 +45,7 @@ class Frames(Protocol):
 
     @property
     def stamp(self) -> str:
-        """What changes when the frames do, e.g. size and date of the file: an import resumes by it."""
+        """What changes when the frames do, e.g. the date of the file; imports resume by it."""
         ...
 
     def read(
@@ -70,8 +70,8 @@ class Samples:
     Attributes:
         values: ``[N, …]``, any type of number.
         times: ``[N]`` in seconds on the clock of the frames. An action holds from its time on.
-        frames: ``[N]``, the number of the frame that each row belongs to, counted from 0 with frames
-            that were lost. Without `times` and `frames` there is one row for each frame, by place.
+        frames: ``[N]``, the number of the frame that each row belongs to, counted from 0 and also
+            over lost frames. Without `times` and `frames`, row i belongs to frame i.
     """
 
     values: NDArray[Any]
@@ -126,8 +126,8 @@ class ActionFacts:
         names: one per dimension; ``action_0``, … if it is empty.
         units: one per dimension; none if it is empty.
         kind: what an action commands.
-        bounds: lower and upper bounds that are stated; an action beyond them is a defect. None takes
-            them from the training episodes.
+        bounds: lower and upper bounds that are stated; an action beyond them is a defect. None:
+            those of the training episodes.
     """
 
     names: tuple[str, ...] = ()

@@ -1,0 +1,274 @@
+"""Frames of videos and pictures: their true times without decoding, and their pixels on request."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError
+from acwm_formats.pixels import as_rgb, depth_as_grey, is_depth, loaded, over_black
+
+CONTAINERS = {"mp4": (4, b"ftyp moov mdat wide free skip".split()), "gif": (0, [b"GIF8"])} | {
+    "matroska": (0, [b"\x1a\x45\xdf\xa3"]),
+    "avi": (8, [b"AVI "]),
+}
+"""FFmpeg's name of a container that is read, and the bytes that it has at a place of its start."""
+
+HDR = (16, 18)  # transfer curves of PQ and HLG, as FFmpeg numbers them
+MILLIMETRE = 0.001
+
+
+class VideoIndex(NamedTuple):
+    """What a video file says about its frames, in the order in which they are shown.
+
+    Attributes:
+        ticks: presentation times ``[N]`` in units of `base`.
+        base: seconds per tick.
+        rate: frames per second that the file states; None if it states none.
+        size: height and width as shown: upright, with square pixels.
+        turns: quarter turns, counterclockwise, that make frames upright.
+        depth: whether its pixels are distances: one channel of more than 8 bits.
+    """
+
+    ticks: NDArray[np.int64]
+    base: Fraction
+    rate: Fraction | None
+    size: tuple[int, int]
+    turns: int
+    depth: bool
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Presentation times ``[N]`` in seconds."""
+        return self.ticks * self.base.numerator / self.base.denominator
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Frames `first` to `stop` of a video file, counted as they are shown; see `Frames`.
+
+    Attributes:
+        path: an MP4, MOV, MKV, WebM, AVI or GIF file, told by its first bytes. FFmpeg's playlists
+            are refused, as they can name other files.
+        unit: metres per number, if it is a depth map.
+    """
+
+    path: Path
+    first: int = 0
+    stop: int | None = None
+    unit: float = MILLIMETRE
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """As in `Frames`."""
+        return video_index(self.path).times[self.first : self.stop]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """As in `Frames`."""
+        return video_index(self.path).size
+
+    @property
+    def depth(self) -> bool:
+        """As in `Frames`."""
+        return video_index(self.path).depth
+
+    @property
+    def stamp(self) -> str:
+        """As in `Frames`."""
+        return f"{self.path.name} {self.first} {self.stop} {file_stamp(self.path)}"
+
+    def read(
+        self, indices: Sequence[int], depth_range: tuple[float, float] | None = None
+    ) -> Iterator[NDArray[np.uint8]]:
+        """As in `Frames`."""
+        index = video_index(self.path)
+        wanted = index.ticks[self.first : self.stop][np.asarray(indices, np.int64)].tolist()
+        frames, shown, image = _decoded(self.path, wanted[0]), None, np.zeros(0, np.uint8)
+        for tick in wanted:
+            while shown is None or shown < tick:
+                frame = next(frames, None)
+                if frame is None:
+                    raise DataError(f"the video {self.path} ends before {_at(index, tick)}")
+                if frame.pts is not None and frame.pts >= tick:
+                    shown, image = frame.pts, self._pixels(frame, index, depth_range)
+            if shown != tick:
+                raise DataError(f"the video {self.path} has no frame {_at(index, tick)}")
+            yield image
+
+    def _pixels(
+        self, frame: Any, index: VideoIndex, depth_range: tuple[float, float] | None
+    ) -> NDArray[np.uint8]:
+        if index.depth:
+            image = depth_as_grey(frame.to_ndarray() * self.unit, depth_range, str(self.path))
+            image = np.ascontiguousarray(np.rot90(image, index.turns))
+            return image
+        size = index.size if index.turns % 2 == 0 else index.size[::-1]
+        shape = {} if size == (frame.height, frame.width) else {"height": size[0], "width": size[1]}
+        if any(component.is_alpha for component in frame.format.components):
+            image = over_black(frame.to_ndarray(format="rgba", **shape))
+        else:
+            image = frame.to_ndarray(format="rgb24", **shape)
+        return np.ascontiguousarray(np.rot90(image, index.turns)) if index.turns else image
+
+
+def video_index(path: Path) -> VideoIndex:
+    """Read where the frames of the video `path` lie in time; only its first frame is decoded.
+
+    Raises:
+        DataError: it is missing, damaged, not a video that can be read, or of high dynamic range.
+    """
+    return _index(path, file_stamp(path))
+
+
+@functools.lru_cache(maxsize=64)
+def _index(path: Path, _: str) -> VideoIndex:
+    with _opened(path) as (container, stream):
+        packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
+    ticks = [p.dts if p.pts is None else p.pts for p in packets]
+    if not ticks or None in ticks:
+        raise DataError(f"the video {path} holds no frame, or frames without times")
+    with _opened(path) as (container, stream):
+        frame = next(container.decode(stream), None)
+        if frame is None:
+            raise DataError(f"the video {path} holds no frame that can be decoded")
+        if stream.codec_context.color_trc in HDR:
+            raise DataError(f"the video {path} has a high dynamic range: convert it to SDR first")
+        if frame.rotation % 90:
+            raise DataError(f"the video {path} is turned by {frame.rotation}°, no quarter turn")
+        turns = frame.rotation // 90 % 4
+        aspect = stream.sample_aspect_ratio or Fraction(1)
+        width = round(frame.width * aspect) if aspect > 0 else frame.width
+        size = (frame.height, width) if turns % 2 == 0 else (width, frame.height)
+        one = len(frame.format.components) == 1 and not frame.format.has_palette
+        depth = one and frame.format.components[0].bits > 8
+        if frame.pts is not None and frame.pts > min(ticks):  # what comes before is not shown
+            ticks = [tick for tick in ticks if tick >= frame.pts]
+        ordered = np.array(sorted(ticks), np.int64)
+        return VideoIndex(ordered, stream.time_base, stream.average_rate, size, turns, depth)
+
+
+def _decoded(path: Path, tick: int) -> Iterator[Any]:
+    """Decode from the last key frame before `tick` on, or everything if seeking leads beyond it."""
+    with _opened(path) as (container, stream):
+        if tick > (stream.start_time or 0):
+            container.seek(tick, stream=stream)
+        frames = _sound(path, container, stream)
+        if (first := next(frames, None)) is not None and (first.pts or 0) <= tick:
+            yield first
+            yield from frames
+            return
+    with _opened(path) as (container, stream):
+        yield from _sound(path, container, stream)
+
+
+def _sound(path: Path, container: Any, stream: Any) -> Iterator[Any]:
+    """Decode, and report damage instead of concealing it."""
+    stream.codec_context.options = {"err_detect": "explode"}
+    for frame in container.decode(stream):
+        if frame.is_corrupt:
+            raise DataError(f"the video {path} is damaged at {frame.time or 0:.3f} s")
+        yield frame
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Generator[tuple[Any, Any]]:
+    """Open a file and its video stream; FFmpeg errors inside the block become `DataError`s."""
+    container: Any  # PyAV's type annotations are incomplete
+    kind = container_of(path)
+    if kind is None:
+        raise DataError(f"{path} is no MP4, MOV, MKV, WebM, AVI or GIF file")
+    try:
+        with av.open(str(path), "r", format=kind, metadata_errors="replace") as container:
+            if not container.streams.video:
+                raise DataError(f"{path} holds no video")
+            stream = container.streams.video[0]
+            stream.codec_context.thread_count = 1
+            yield container, stream
+    except FFmpegError as error:
+        raise DataError(f"the video {path} cannot be read ({error.strerror})") from error
+
+
+def container_of(path: Path) -> str | None:
+    """FFmpeg's name of the container of a file, told by its first bytes; None for other files."""
+    with path.open("rb") as file:
+        start = file.read(12)
+    for name, (place, marks) in CONTAINERS.items():
+        if any(start[place:].startswith(mark) for mark in marks):
+            return name
+    return None
+
+
+def file_stamp(path: Path) -> str:
+    """Size and date of a file, which change when it does."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror})") from error
+    return f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _at(index: VideoIndex, tick: int) -> str:
+    return f"at {float(tick * index.base):.3f} s"
+
+
+@dataclass(frozen=True)
+class ImageFrames:
+    """Frames in memory or in files of pictures, with times of their own; see `Frames`.
+
+    Attributes:
+        images: for each frame an array, a path to a picture, or the bytes of one. A sequence that
+            reads them on request keeps memory small.
+        times: ``[N]`` in seconds.
+        unit: metres per whole number, if they are depth maps; floating-point ones are in metres.
+        stamp: as in `Frames`.
+    """
+
+    images: Sequence[Any]
+    times: NDArray[np.float64]
+    unit: float = MILLIMETRE
+    stamp: str = ""
+
+    @functools.cached_property
+    def _first(self) -> NDArray[Any]:
+        if not len(self.images):
+            raise DataError("it holds no frame")
+        return loaded(self.images[0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """As in `Frames`."""
+        return self._first.shape[:2]
+
+    @property
+    def depth(self) -> bool:
+        """As in `Frames`."""
+        return is_depth(self._first)
+
+    def read(
+        self, indices: Sequence[int], depth_range: tuple[float, float] | None = None
+    ) -> Iterator[NDArray[np.uint8]]:
+        """As in `Frames`."""
+        for index in indices:
+            image, name = loaded(self.images[index]), f"frame {index}"
+            if is_depth(image):
+                metres = image if image.dtype.kind == "f" else image * self.unit
+                yield depth_as_grey(metres, depth_range, name)
+            else:
+                yield as_rgb(image, name)
+
+
+def regular_times(count: int, rate: float | Fraction) -> NDArray[np.float64]:
+    """Times of `count` frames at a constant rate, from 0."""
+    return np.arange(count) / float(rate) if math.isfinite(rate) else np.zeros(count)
