@@ -17,7 +17,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
-from acwm_formats.pixels import as_rgb, depth_as_grey, is_depth, loaded, over_black
+from acwm_formats.images import channels_last, guessed_range, is_depth, read_image, to_rgb
 
 CONTAINERS = {"mp4": (4, b"ftyp moov mdat wide free skip".split()), "gif": (0, [b"GIF8"])} | {
     "matroska": (0, [b"\x1a\x45\xdf\xa3"]),
@@ -111,15 +111,13 @@ class VideoFrames:
         self, frame: Any, index: VideoIndex, depth_range: tuple[float, float] | None
     ) -> NDArray[np.uint8]:
         if index.depth:
-            image = depth_as_grey(frame.to_ndarray() * self.unit, depth_range, str(self.path))
-            image = np.ascontiguousarray(np.rot90(image, index.turns))
-            return image
+            metres = frame.to_ndarray().astype(np.float32) * self.unit
+            image = to_rgb(metres, depth_range=depth_range)
+            return np.ascontiguousarray(np.rot90(image, index.turns))
         size = index.size if index.turns % 2 == 0 else index.size[::-1]
         shape = {} if size == (frame.height, frame.width) else {"height": size[0], "width": size[1]}
-        if any(component.is_alpha for component in frame.format.components):
-            image = over_black(frame.to_ndarray(format="rgba", **shape))
-        else:
-            image = frame.to_ndarray(format="rgb24", **shape)
+        clear = any(component.is_alpha for component in frame.format.components)
+        image = to_rgb(frame.to_ndarray(format="rgba" if clear else "rgb24", **shape))
         return np.ascontiguousarray(np.rot90(image, index.turns)) if index.turns else image
 
 
@@ -228,15 +226,18 @@ class ImageFrames:
     """Frames in memory or in files of pictures, with times of their own; see `Frames`.
 
     Attributes:
-        images: for each frame an array, a path to a picture, or the bytes of one. A sequence that
+        images: for each frame an array, the path of a picture, or the bytes of one. A sequence that
             reads them on request keeps memory small.
         times: ``[N]`` in seconds.
+        pixel_range: the values that are black and white, see `to_rgb`; guessed from the first image
+            by default.
         unit: metres per whole number, if they are depth maps; floating-point ones are in metres.
         stamp: as in `Frames`.
     """
 
     images: Sequence[Any]
     times: NDArray[np.float64]
+    pixel_range: tuple[float, float] | None = None
     unit: float = MILLIMETRE
     stamp: str = ""
 
@@ -244,12 +245,13 @@ class ImageFrames:
     def _first(self) -> NDArray[Any]:
         if not len(self.images):
             raise DataError("it holds no frame")
-        return loaded(self.images[0])
+        return _image(self.images[0])
 
     @property
     def size(self) -> tuple[int, int]:
         """As in `Frames`."""
-        return self._first.shape[:2]
+        height, width = channels_last(self._first).shape[:2]
+        return height, width
 
     @property
     def depth(self) -> bool:
@@ -260,13 +262,18 @@ class ImageFrames:
         self, indices: Sequence[int], depth_range: tuple[float, float] | None = None
     ) -> Iterator[NDArray[np.uint8]]:
         """As in `Frames`."""
+        pixel_range = self.pixel_range or guessed_range(self._first)
         for index in indices:
-            image, name = loaded(self.images[index]), f"frame {index}"
-            if is_depth(image):
-                metres = image if image.dtype.kind == "f" else image * self.unit
-                yield depth_as_grey(metres, depth_range, name)
-            else:
-                yield as_rgb(image, name)
+            image = _image(self.images[index])
+            if self.depth and image.dtype.kind != "f":
+                image = image.astype(np.float32) * self.unit
+            yield to_rgb(image, depth_range=depth_range, pixel_range=pixel_range)
+
+
+def _image(image: Any) -> NDArray[Any]:
+    if isinstance(image, str | Path | bytes):
+        return read_image(Path(image) if isinstance(image, str) else image)
+    return np.asarray(image)
 
 
 def regular_times(count: int, rate: float | Fraction) -> NDArray[np.float64]:
