@@ -124,7 +124,7 @@ def make_env(name: str, *, task: str | None = None, **params: Any) -> Environmen
         **params: constructor arguments, such as ``size=64`` for frames `[64, 64, 3]`.
 
     Raises:
-        UnknownNameError: no such environment or task.
+        RecipeError: no such environment or task.
         MissingExtraError: its simulator is not installed.
     """
     return _make(name, task=task, **params)
@@ -134,7 +134,7 @@ def make_task(environment: str, name: str) -> Task:
     """Load a task, which measures how far a state is from a goal. It needs no simulator.
 
     Raises:
-        UnknownNameError: no such environment or task.
+        RecipeError: no such environment or task.
     """
     return catalog().component("environment", environment).load_task(name)
 
@@ -147,7 +147,7 @@ def make_planner(name: str, **params: Any) -> Planner:
         **params: constructor arguments, such as ``horizon=5``.
 
     Raises:
-        UnknownNameError: no such planner.
+        RecipeError: no such planner.
     """
     from acwm_planning.planner import Planner  # imports torch
 

@@ -13,6 +13,8 @@ from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
+from acwm_core.renamed import renamed_attribute
+
 
 class AcwmError(Exception):
     """Base of every error a user can cause and fix."""
@@ -24,26 +26,6 @@ class RecipeError(AcwmError):
     """A recipe or an override is wrong: unknown component, parameter, type or file."""
 
 
-class UnknownNameError(RecipeError):
-    """Nothing is registered under a name.
-
-    Args:
-        kind: what was looked for, e.g. ``"environment"``.
-        name: the name that was not found.
-        known: the existing names, to suggest the most similar one.
-        hint: a last sentence, e.g. how to list the names.
-    """
-
-    def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
-        self._given = kind, name, [*known], hint
-        message = f"unknown {kind} {name!r}{suggest(name, self._given[2])}"
-        super().__init__(f"{message} {hint}" if hint else message)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the arguments instead of the message, so that it can leave a worker process."""
-        return type(self), self._given, self.__dict__
-
-
 class MissingExtraError(AcwmError):
     """An optional dependency is not installed; the message names the extra to install."""
 
@@ -53,41 +35,15 @@ class PluginError(AcwmError):
 
 
 class ShapeError(AcwmError, ValueError):
-    """An array or tensor has the wrong shape, dtype or range."""
-
-
-class ActionError(AcwmError, ValueError):
-    """An action has the wrong shape, is out of its bounds or not finite."""
+    """An array, a tensor or an action has the wrong shape, dtype or range."""
 
 
 class DataError(AcwmError):
-    """A dataset is missing, damaged, or not the requested one."""
-
-
-class OtherDatasetError(DataError):
-    """The folder to write a dataset to already holds a different one.
-
-    Args:
-        folder: the folder.
-        differences: how the datasets differ, as phrases.
-
-    Attributes:
-        found: the message without its advice, for callers that give their own.
-    """
-
-    def __init__(self, folder: Path, differences: Iterable[str]) -> None:
-        self.found = f"{folder} holds another dataset: {'; '.join(differences)}"
-        super().__init__(
-            f"{self.found}. Choose another --out, or delete the folder to create it again"
-        )
+    """A dataset, checkpoint or result is missing, damaged, or not the requested one."""
 
 
 class TrainingError(AcwmError):
     """Training cannot start or go on: NaN loss, a run folder in use, nothing to resume."""
-
-
-class CheckpointError(AcwmError):
-    """A checkpoint of another program does not contain what a model needs."""
 
 
 class AcwmWarning(UserWarning):
@@ -192,6 +148,15 @@ def expect(condition: object, problem: str) -> None:
         raise DataError(problem)
 
 
+def unknown_name(kind: str, name: str, known: Iterable[str], hint: str = "") -> RecipeError:
+    """The error that there is no `kind` of this name; suggests the most similar of the `known`.
+
+    Args:
+        hint: a last sentence, e.g. how to list the names.
+    """
+    return RecipeError(f"unknown {kind} {name!r}{suggest(name, known)} {hint}".rstrip())
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"`, or at most eight of the known names if none is similar."""
     import difflib
@@ -205,3 +170,7 @@ def suggest(name: str, known: Iterable[str]) -> str:
         return "; there is none."
     listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
     return f"; known: {listed}."
+
+
+def __getattr__(name: str) -> Any:
+    return renamed_attribute(__name__, name)

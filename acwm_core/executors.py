@@ -110,7 +110,7 @@ def create_executor(
         options: its further parameters.
 
     Raises:
-        UnknownNameError: no executor has that name.
+        RecipeError: no executor has that name.
         RecipeError: it has no such parameter, a value is invalid, or it cannot work here.
         MissingExtraError: something that it needs is not installed.
     """

@@ -30,9 +30,9 @@ from acwm_core.errors import (
     AcwmError,
     MissingExtraError,
     PluginError,
-    UnknownNameError,
     noting,
     sentence,
+    unknown_name,
 )
 
 Made = TypeVar("Made")
@@ -168,11 +168,11 @@ class Component:
         """Import a task of an environment; works without its simulator.
 
         Raises:
-            UnknownNameError: it has no task of that name.
+            RecipeError: it has no task of that name.
             PluginError: as for `load`.
         """
         if name not in self.tasks:
-            raise UnknownNameError(f"{self.name} task", name, self.tasks)
+            raise unknown_name(f"{self.name} task", name, self.tasks)
         return self._imported(self.tasks[name])
 
     def _imported(self, target: str) -> Any:
@@ -283,11 +283,11 @@ class Registry:
         self._components.setdefault(component.name, component)
 
     def __getitem__(self, name: str) -> Component:
-        """Look up a component; `UnknownNameError` suggests a similar name."""
+        """Look up a component; `RecipeError` suggests a similar name."""
         try:
             return self._components[name]
         except KeyError:
-            raise UnknownNameError(self.kind.replace("_", " "), name, self._components) from None
+            raise unknown_name(self.kind.replace("_", " "), name, self._components) from None
 
     def __contains__(self, name: object) -> bool:
         return name in self._components
@@ -374,22 +374,22 @@ class Catalog:
         return [kind for kind in self._registries if kind != "kind"]
 
     def registry(self, kind: str) -> Registry:
-        """The registry of one kind; `UnknownNameError` suggests a similar kind."""
+        """The registry of one kind; `RecipeError` suggests a similar kind."""
         if kind not in self._registries:
-            raise UnknownNameError("kind", kind, self._registries)
+            raise unknown_name("kind", kind, self._registries)
         return self._registries[kind]
 
     def component(self, kind: str, name: str) -> Component:
         """Look up a component.
 
         Raises:
-            UnknownNameError: there is none; suggests a similar name, and lists broken plugins.
+            RecipeError: there is none; suggests a similar name, and lists broken plugins.
         """
         registry = self.registry(kind)
         if name not in registry and self.problems:
             left = "; ".join(f"plugin {p.plugin!r} was left out: {p.reason}" for p in self.problems)
             known = registry.components()
-            raise UnknownNameError(kind.replace("_", " "), name, known, f"({left})")
+            raise unknown_name(kind.replace("_", " "), name, known, f"({left})")
         return registry[name]
 
     def create(self, kind: str, name: str, **params: Any) -> Any:

@@ -78,6 +78,30 @@ RENAMED = {
 """New names of the modules that packages of other authors import, by old name."""
 
 
+RENAMED_ATTRIBUTES = {
+    "acwm_core.errors": {
+        "ActionError": "ShapeError",
+        "CheckpointError": "DataError",
+        "OtherDatasetError": "DataError",
+        "UnknownNameError": "RecipeError",
+    }
+}
+"""New names of what such packages import from a module, by module and old name."""
+
+
+def renamed_attribute(module: str, name: str) -> Any:
+    """What a module has under its new name, for the `__getattr__` of the module.
+
+    Raises:
+        AttributeError: the module never had this name.
+    """
+    new = RENAMED_ATTRIBUTES[module].get(name)
+    if new is None:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    warnings.warn(f"{module}.{name} is now called {new}", RenamedWarning, stacklevel=3)
+    return getattr(sys.modules[module], new)
+
+
 class RenamedModules(MetaPathFinder, Loader):
     """Finds a renamed module by its old name: the same module object as by the new one."""
 

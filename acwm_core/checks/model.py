@@ -44,7 +44,7 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
         **params: constructor parameters, for instance a small width; not `latent_channels`.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+        RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     checks = DynamicsChecks(model, **params)
     yield from run_checks(checks)

@@ -110,6 +110,6 @@ class Suite:
             **params: constructor parameters, for instance a small width.
 
         Raises:
-            UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+            RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
         """
         return run_checks(cls(component, *args, **params))

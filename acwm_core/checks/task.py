@@ -27,7 +27,7 @@ def check_task(name: str) -> Iterator[CheckResult]:
         name: ``ENVIRONMENT.TASK``.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
+        RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     catalog().component("task", name)
     environment, _, task = name.partition(".")

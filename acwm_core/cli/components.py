@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from acwm_core.cli.arguments import split_parameters
-from acwm_core.errors import RecipeError, UnknownNameError, sentence
+from acwm_core.errors import RecipeError, sentence, unknown_name
 from acwm_core.plugins import Component, catalog
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def list_components(kind: str | None) -> None:
         return
     known = catalog().kinds
     if kind not in (None, "kind", *known):
-        raise UnknownNameError("kind", kind, [*known, "kind", "recipe"])
+        raise unknown_name("kind", kind, [*known, "kind", "recipe"])
     for each in [kind] if kind else known:
         console.print(_table(each, with_tasks=kind == "task"), end="\n\n")
     for problem in catalog().problems:
@@ -109,7 +109,7 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
     kinds = [kind for kind in catalog().kinds if name in catalog().registry(kind)]
     if not kinds:
         known = {each.name for kind in catalog().kinds for each in catalog().registry(kind)}
-        raise UnknownNameError("component", name, known)
+        raise unknown_name("component", name, known)
     suites = {kind: suite for kind in kinds if (suite := _suite(kind))}
     if not suites:
         raise RecipeError(f"there are no checks of {_plural(kinds[0])}, and so none of {name}")

@@ -172,6 +172,14 @@ class DatasetCard:
         return found
 
 
+def other_dataset(folder: Path, differences: Iterable[str]) -> DataError:
+    """The error that the folder to write a dataset to holds one with these `differences`."""
+    return DataError(
+        f"{folder} holds another dataset: {'; '.join(differences)}. Choose another folder, or "
+        "delete this one to create it again"
+    )
+
+
 def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
     """Versions of the platform, acwm, NumPy, PyAV and `packages`."""
     versions = {"platform": f"{platform.system()} {platform.machine()}"}

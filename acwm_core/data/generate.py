@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.card import CARD, DatasetCard, package_versions
+from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
 from acwm_core.data.shards import ShardRecord, open_shard, shard_name, write_shard
 from acwm_core.data.simulate import make_environment, simulated
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, FactorSetting, Split, draw_factors
-from acwm_core.errors import DataError, OtherDatasetError, RecipeError, suggest
+from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.executors import Executor, LocalExecutor, Report, progress_bar
 from acwm_core.files import LOCK, held, remove_partial, writing
 from acwm_core.plugins import catalog
@@ -71,7 +71,7 @@ def generate(
         The card of the folder.
 
     Raises:
-        UnknownNameError: no such environment.
+        RecipeError: no such environment.
         RecipeError: a factor, split, count or share is not possible.
         DataError: the folder holds another dataset or is in use, or an episode failed.
     """
@@ -216,7 +216,7 @@ def fill(
         there = DatasetCard.read(out) if (out / CARD).exists() else wanted
         differences = there.differences(wanted)
         if others := [each for each in differences if not each.startswith("versions.")]:
-            raise OtherDatasetError(out, others)
+            raise other_dataset(out, others)
         for split in wanted.splits:
             remove_partial(out / split)
         manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
@@ -224,7 +224,7 @@ def fill(
         joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
         if tasks:
             if differences:  # other versions matter only if shards are still to be made
-                raise OtherDatasetError(out, differences)
+                raise other_dataset(out, differences)
             joined.write(out)  # first, so that a folder with any content has a card
             for split in wanted.splits:
                 (out / split).mkdir(exist_ok=True)

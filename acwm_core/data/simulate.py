@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec
-from acwm_core.errors import (
-    ActionError,
-    PluginError,
-    ShapeError,
-    expect,
-    noting,
-)
+from acwm_core.errors import PluginError, ShapeError, expect, noting
 from acwm_core.plugins import Component, catalog
 
 
@@ -32,7 +26,7 @@ def make_environment(
         options: constructor options, e.g. ``{"size": 64}``, as in `EpisodeSpec.options`.
 
     Raises:
-        UnknownNameError: no environment has that name.
+        RecipeError: no environment has that name.
         PluginError: it cannot be constructed (e.g. it has no such option), is not an
             `Environment`, or its card has another name.
     """
@@ -68,7 +62,7 @@ def simulate(
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
-        ActionError: an action has the wrong shape, is out of its bounds or not finite.
+        ShapeError: an action has the wrong shape, is out of its bounds or not finite.
         DataError: within the episode, the shapes of frames, masks or states, the state fields or
             the card change.
         PluginError: the environment raised something else.
@@ -99,7 +93,7 @@ def simulate(
             action = np.asarray(act(), np.float32)
             if action.shape != taken[index].shape:  # a scalar would be broadcast
                 wanted = f"{card.name} takes actions of shape {taken[index].shape}"
-                raise ActionError(f"{wanted}, not {action.shape}")
+                raise ShapeError(f"{wanted}, not {action.shape}")
             taken[index] = action
             frame, _, _, _, info = environment.step(action)
             look(frame, info)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.episode import Episode, Factor
-from acwm_core.errors import ActionError, ShapeError, expect
+from acwm_core.errors import ShapeError, expect
 
 ActionKind = Literal["absolute", "delta", "torque"]
 """What an action commands: a position, a change of position, or a force or torque."""
@@ -30,7 +30,7 @@ class ActionSpec:
 
     Raises:
         ShapeError: the lengths differ, or a lower bound is not below its upper bound.
-        ActionError: the kind is unknown.
+        ShapeError: the kind is unknown.
     """
 
     names: tuple[str, ...]
@@ -48,7 +48,7 @@ class ActionSpec:
             raise ShapeError("every lower action bound must lie below its upper bound, both finite")
         if self.kind not in get_args(ActionKind):
             known = ", ".join(get_args(ActionKind))
-            raise ActionError(f"the kind of an action is one of {known}, not {self.kind!r}")
+            raise ShapeError(f"the kind of an action is one of {known}, not {self.kind!r}")
 
     @property
     def size(self) -> int:

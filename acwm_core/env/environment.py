@@ -20,7 +20,7 @@ from acwm_core.env.card import ActionSpec as ActionSpec
 from acwm_core.env.card import EnvironmentCard as EnvironmentCard
 from acwm_core.env.card import StateField as StateField
 from acwm_core.env.episode import EpisodeSpec, FactorValue, draw_factors, ood_label
-from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors import AcwmError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
 """A behaviour policy: each call reads the simulator and returns the next raw action, `[A]`."""
@@ -156,7 +156,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """Apply one raw action for one frame.
 
         Raises:
-            ActionError: wrong shape, not finite, or out of bounds (wrap the environment in
+            ShapeError: wrong shape, not finite, or out of bounds (wrap the environment in
                 `gymnasium.wrappers.ClipAction` to clip instead).
         """
         self.advance(action)
@@ -167,7 +167,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def advance(self, action: NDArray[np.floating[Any]]) -> None:
         """As `step`, but without rendering and observing, which takes most of the time."""
         if self._spec is None:
-            raise ActionError("call reset() before step()")
+            raise AcwmError("call reset() before step()")
         self._advance(self._checked(action))
         self._frame_index += 1
 
@@ -216,7 +216,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def episode_spec(self) -> EpisodeSpec:
         """The spec of the current episode."""
         if self._spec is None:
-            raise ActionError("call reset() before anything else")
+            raise AcwmError("call reset() before anything else")
         return self._spec
 
     @property
@@ -233,18 +233,18 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
     def _checked(self, action: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         values, spec = np.asarray(action, np.float32), self.card.action
         if values.shape != (spec.size,):
-            raise ActionError(
+            raise ShapeError(
                 f"{self.card.name} takes an action of shape ({spec.size},), not {values.shape}"
             )
         if not np.all(np.isfinite(values)):
-            raise ActionError(f"{self.card.name} was given an action that is not finite: {values}")
+            raise ShapeError(f"{self.card.name} was given an action that is not finite: {values}")
         low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         slack = 1e-6 * (high - low)  # float32 rounding of a bound is no violation
         for name, value, at_least, at_most in zip(
             spec.names, values, low - slack, high + slack, strict=True
         ):
             if not at_least <= value <= at_most:
-                raise ActionError(
+                raise ShapeError(
                     f"action {name}={value:g} of {self.card.name} is out of its bounds "
                     f"[{at_least:g}, {at_most:g}]; wrap it in gymnasium.wrappers.ClipAction to clip"
                 )

@@ -37,7 +37,7 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
         card: the card of the dataset or of its environment; gives the action's size and bounds.
 
     Raises:
-        UnknownNameError, MissingExtraError, PluginError: a component cannot be created.
+        RecipeError, MissingExtraError, PluginError: a component cannot be created.
         RecipeError: the components do not fit together, or the model not the recipe's clips.
     """
     card = card if isinstance(card, EnvironmentCard) else card.environment

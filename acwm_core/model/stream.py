@@ -85,7 +85,7 @@ class Stream:
 
         Raises:
             ShapeError: the number of actions or of batch elements is wrong.
-            ActionError: actions have the wrong size, are not finite, or out of bounds.
+            ShapeError: actions have the wrong size, are not finite, or out of bounds.
         """
         return self._decode(self._advance(actions, check=True))
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
@@ -170,7 +170,7 @@ class WorldModel(nn.Module):
         Raises:
             ShapeError: batch sizes differ, there are too few frames, the window is too small, or
                 the K frames are no whole latent frames.
-            ActionError: wrong action size.
+            ShapeError: wrong action size.
             RecipeError: `mode` is unknown, or "stream" and the components cannot be streamed.
         """
         video = self._given(given)
@@ -223,14 +223,14 @@ class WorldModel(nn.Module):
             RecipeError: the components cannot be streamed.
             ShapeError: there is not one seed per batch element, frames or actions don't fit, or
                 frames are not float in [0, 1].
-            ActionError: actions have the wrong size or are not finite.
+            ShapeError: actions have the wrong size or are not finite.
         """
         check_pixels(given)
         video = self._given(given)
         if actions is None:
             actions = video.new_zeros(len(video), 0, len(self.action_low))
         if not actions.isfinite().all():
-            raise ActionError("the actions are not finite")
+            raise ShapeError("the actions are not finite")
         context = self.codec.latent_frames(self.clip_frames) if context is None else context
         generators = _generators(video, len(video), seeds)
         return Stream(self, video, actions, steps=steps, context=context, generators=generators)
@@ -269,19 +269,19 @@ class WorldModel(nn.Module):
 
         Raises:
             ShapeError: they do not have three dimensions.
-            ActionError: wrong action size, not finite, or out of bounds.
+            ShapeError: wrong action size, not finite, or out of bounds.
         """
         if actions.ndim != 3:
             raise ShapeError(f"actions are [B, T, A], not {list(actions.shape)}")
         self.normalise(actions)
         if not actions.isfinite().all():
-            raise ActionError("the actions are not finite")
+            raise ShapeError("the actions are not finite")
         low, high = self.action_low, self.action_high
         slack = 1e-6 * (high - low)  # float32 rounding of a bound is no violation
         outside = ((actions < low - slack) | (actions > high + slack)).flatten(0, 1).any(0)
         if outside.any():
             size = int(outside.int().argmax())
-            raise ActionError(
+            raise ShapeError(
                 f"dimension {size} of the actions is out of its bounds "
                 f"[{low[size]:g}, {high[size]:g}]: clip it, with "
                 "actions.clamp(world_model.action_low, world_model.action_high)"
@@ -291,7 +291,7 @@ class WorldModel(nn.Module):
     def normalise(self, actions: Actions) -> Actions:
         """Scale raw actions `[B, T, A]` to [-1, 1] by their bounds."""
         if actions.shape[2] != len(self.action_low):
-            raise ActionError(
+            raise ShapeError(
                 f"the model was built for {len(self.action_low)} action dimensions, "
                 f"not {actions.shape[2]}"
             )

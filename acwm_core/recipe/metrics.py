@@ -33,7 +33,7 @@ class MetricConfig:
         """Construct the metric; for ``LIBRARY.path.Class``, as ``LIBRARY(metric_class=...)``.
 
         Raises:
-            UnknownNameError: no such metric is registered.
+            RecipeError: no such metric is registered.
             MissingExtraError: its library is not installed.
         """
         registered, dot, _ = self.component.partition(".")

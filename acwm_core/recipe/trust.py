@@ -22,9 +22,13 @@ NAMES_OF_CODE = ("class_path", "metric_class", "function", "detector")
 FOLDER = "default_root_dir"
 """The flag of the trainer that names a folder, which training writes to."""
 
-_IMPORTED = re.compile(r"[A-Za-z_]\w*(\.\w+)*:[A-Za-z_]\w*(\.\w+)*")
-_OVERRIDE = re.compile(r"[\w.]+=")
+_IMPORTED = re.compile(r"[^\W\d]\w*(\.\w+)*:[^\W\d]\w*(\.\w+)*")
+"""What `import_named` takes, ``module:name``."""
 
+_PLAIN = re.compile(r"[\w:,+ -]*|-?\d+\.\d*")
+"""Text of the section `trainer` that is no name of code: Lightning parses any other as YAML."""
+
+_OVERRIDE = re.compile(r"[\w.]+=")
 
 _is_said = False
 
@@ -75,7 +79,7 @@ def _code(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     name = place.rpartition(".")[2].partition("[")[0]
     in_trainer = place.startswith("trainer.")
     if isinstance(values, Mapping):
-        if in_trainer:  # the class and arguments of an object
+        if in_trainer and name != "max_time":  # the class and arguments of an object
             yield place, values
         for key, value in cast(Mapping[Any, Any], values).items():
             yield from _code(value, f"{place}.{key}" if place else str(key))
@@ -88,7 +92,7 @@ def _code(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
         elif (
             name in (*NAMES_OF_CODE, FOLDER)
             or _IMPORTED.fullmatch(values)
-            or (in_trainer and "." in values)
+            or (in_trainer and not _PLAIN.fullmatch(values))
         ):
             yield place, values
 
@@ -103,9 +107,9 @@ def import_named(name: str, asked: str) -> Any:
     Raises:
         RecipeError: it is not written as ``module:name``, or there is no such module or name.
     """
-    module, colon, attribute = name.partition(":")
-    if not (module and colon and attribute):
+    if not _IMPORTED.fullmatch(name):
         raise RecipeError(f"{asked} cannot be imported: write it as module:name")
+    module, _, attribute = name.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
     try:

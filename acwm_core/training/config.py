@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.errors import RecipeError, unknown_name
 
 LOGGERS = {"csv": "", "tensorboard": "", "wandb": "WandbLogger", "mlflow": "MLFlowLogger"}
 """Names that `trainer.logger` accepts, with Lightning's class; the first two are built in."""
@@ -29,13 +29,13 @@ def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
     """The loggers listed in the flag `logger` of the section `trainer`; names are checked.
 
     Raises:
-        UnknownNameError: a name is not in `LOGGERS`.
+        RecipeError: a name is not in `LOGGERS`.
     """
     given = flags.get("logger")
     listed = cast(list[Any], given if isinstance(given, list) else [given])
     for each in listed:
         if isinstance(each, str) and each not in LOGGERS:
-            raise UnknownNameError("logger", each, LOGGERS)
+            raise unknown_name("logger", each, LOGGERS)
     return [each for each in listed if not isinstance(each, bool | None)]
 
 

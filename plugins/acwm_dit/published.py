@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from acwm_core.errors import CheckpointError
+from acwm_core.errors import DataError
 from acwm_dit.actions import ConvolutionalActions
 from acwm_dit.adaln import AdaLN
 from acwm_dit.cross_attention import CrossAttention
@@ -45,10 +45,10 @@ def convert(
         The state dicts for `model.load_state_dict` and `conditioner.load_state_dict`.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected, or has the wrong shape; names the tensor.
+        DataError: a tensor is missing, unexpected, or has the wrong shape; names the tensor.
     """
     if not isinstance(conditioner.embedder, ConvolutionalActions):
-        raise CheckpointError(
+        raise DataError(
             "published weights embed actions with convolutions; give the conditioner "
             "embedding=convolutional"
         )
@@ -71,17 +71,17 @@ def _check(published: Mapping[str, Tensor], sources: list[_Source]) -> None:
     expected = {source.name: source.shape for source in sources}
     missing = sorted(expected.keys() - published.keys())
     if missing:
-        raise CheckpointError(f"the checkpoint lacks {_listed(missing)}")
+        raise DataError(f"the checkpoint lacks {_listed(missing)}")
     unexpected = sorted(published.keys() - expected.keys())
     if unexpected:
-        raise CheckpointError(
+        raise DataError(
             f"the checkpoint holds {_listed(unexpected)}, which this model and conditioner "
             "have no place for"
         )
     for name, shape in expected.items():
         found = tuple(published[name].shape)
         if found != shape:
-            raise CheckpointError(f"{name} has shape {found} in the checkpoint, not {shape}")
+            raise DataError(f"{name} has shape {found} in the checkpoint, not {shape}")
 
 
 def _listed(names: list[str]) -> str:

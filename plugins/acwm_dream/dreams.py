@@ -130,7 +130,7 @@ class Dreams:
     Raises:
         TrainingError: there is no such run.
         RecipeError: the model cannot be streamed, or there is no simulator to start from.
-        UnknownNameError: there is no such task.
+        RecipeError: there is no such task.
         DataError: no estimator can judge the task, or there is no dataset.
     """
 
@@ -212,7 +212,7 @@ class Dreams:
         """Advance some episodes, given in ascending order, with raw actions `[n, A]`.
 
         Raises:
-            ActionError: the actions have the wrong size, are not finite, or are out of bounds.
+            ShapeError: the actions have the wrong size, are not finite, or are out of bounds.
         """
         by_episode = dict(zip(which, actions, strict=True))
         frames: dict[int, Frames] = {}

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.errors import ActionError, RecipeError
+from acwm_core.errors import AcwmError, RecipeError
 from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
 
@@ -63,11 +63,11 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         """Predict one latent frame under one action.
 
         Raises:
-            ActionError: `reset` was not called, or the action has the wrong size, is not finite, or
+            ShapeError: `reset` was not called, or the action has the wrong size, is not finite, or
                 is out of bounds.
         """
         if self._steps < 0:
-            raise ActionError("call reset() before step()")
+            raise AcwmError("call reset() before step()")
         result = self._dreams.step([0], np.asarray(action, np.float32)[None])
         self._steps, self._frame = self._steps + 1, result.frames[0]
         over = self._steps >= self._dreams.max_steps

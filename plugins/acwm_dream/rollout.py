@@ -20,10 +20,10 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import (
-    ActionError,
     AcwmWarning,
     DataError,
     RecipeError,
+    ShapeError,
     TrainingError,
     suggest,
 )
@@ -87,7 +87,7 @@ def rollout_run(
         RecipeError: the split, mode, device or file ending is unknown, or the model does not
             support the request.
         DataError: the episode does not exist or is too short, or a file cannot be read.
-        ActionError: the actions have the wrong shape, are not finite, or are out of bounds.
+        ShapeError: the actions have the wrong shape, are not finite, or are out of bounds.
     """
     out = Path(out)
     if out.suffix not in (".mp4", ".png"):
@@ -225,8 +225,8 @@ def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
         raise DataError(f"{path} cannot be read as a .npy array: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):
         names = ", ".join(spec.names)
-        raise ActionError(f"{path} is of shape {rows.shape}, not (N, {spec.size}): {names}")
+        raise ShapeError(f"{path} is of shape {rows.shape}, not (N, {spec.size}): {names}")
     low, high = np.array([spec.low, spec.high], np.float32)  # rounded as the rows are
     if not np.all((rows >= low) & (rows <= high)):  # so NaN is refused too
-        raise ActionError(f"{path} has actions outside their bounds, {spec.low} to {spec.high}")
+        raise ShapeError(f"{path} has actions outside their bounds, {spec.low} to {spec.high}")
     return np.concatenate([rows, np.zeros((1, spec.size), np.float32)])

@@ -10,7 +10,7 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from acwm_core.errors import ActionError, RecipeError
+from acwm_core.errors import AcwmError, RecipeError, ShapeError
 from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
 
@@ -71,10 +71,10 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
     ) -> tuple[Frames, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Predict one latent frame of each episode; see `Dream.step`."""
         if (self._steps < 0).any():
-            raise ActionError("call reset() before step()")
+            raise AcwmError("call reset() before step()")
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
-            raise ActionError(f"actions are {self.action_space.shape}, not {rows.shape}")
+            raise ShapeError(f"actions are {self.action_space.shape}, not {rows.shape}")
         ended, running = (np.flatnonzero(each).tolist() for each in (self._over, ~self._over))
         rewards, solved = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         info: dict[str, Any] = {}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Observation, Physics, StateEstimator
-from acwm_core.errors import ShapeError, UnknownNameError
+from acwm_core.errors import ShapeError, unknown_name
 from acwm_core.model.shapes import Clip
 from acwm_core.plugins import catalog
 from acwm_estimators.curve import evenly, trace
@@ -36,7 +36,7 @@ class Estimator(StateEstimator):
             with the package.
 
     Raises:
-        UnknownNameError: no weights ship for this environment.
+        RecipeError: no weights ship for this environment.
         ShapeError: the card lacks instances that are read, so it belongs to other data.
         DataError: the file does not exist or holds other weights.
     """
@@ -44,7 +44,7 @@ class Estimator(StateEstimator):
     def __init__(self, card: EnvironmentCard, *, weights: str | None = None) -> None:
         super().__init__(card)
         if card.name not in WEIGHTS:
-            raise UnknownNameError("estimator", card.name, WEIGHTS)
+            raise unknown_name("estimator", card.name, WEIGHTS)
         self.layout = layout_of(card.name)
         self.instances = self.layout.instances
         missing = [name for name in self.instances if name not in card.instances]

@@ -10,6 +10,7 @@ from typing import Any
 
 import ray
 import ray.exceptions
+from ray.job_config import JobConfig
 
 from acwm_core.errors import DataError
 from acwm_core.executors import POLL, Executor, Report, Result, Task
@@ -70,6 +71,7 @@ class RayExecutor(Executor):
 
     def _connect(self) -> None:
         settings: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        settings["job_config"] = _Job()
         if self.address is None:
             settings |= {"num_cpus": self.workers, "include_dashboard": False}
         try:
@@ -82,6 +84,13 @@ class RayExecutor(Executor):
                 f"there is no Ray cluster at {self.address or 'this machine'} ({reason}): start "
                 "one with `ray start --head`, or leave out executor.address"
             ) from error
+
+
+class _Job(JobConfig):
+    """A job whose workers import no module from the working folder."""
+
+    def _runtime_env_has_working_dir(self) -> bool:
+        return True  # otherwise Ray begins their path with the driver's folders
 
 
 def _knock(address: str) -> None:

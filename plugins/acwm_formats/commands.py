@@ -12,7 +12,7 @@ import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
-from acwm_core.errors import DataError, UnknownNameError
+from acwm_core.errors import DataError, unknown_name
 
 if TYPE_CHECKING:
     from acwm_core.plugins import Registry
@@ -139,7 +139,7 @@ class FormatGroup(click.Group):
 
         if self._method == "write":
             known = ", ".join(self.list_commands(click.Context(self)))
-            raise UnknownNameError("format", path, _formats().components(), f"(one of {known})")
+            raise unknown_name("format", path, _formats().components(), f"(one of {known})")
         if not Path(path).exists():
             return path  # it is meant as a name: `get_command` suggests the closest
         name = detected_format(Path(path))
@@ -147,7 +147,7 @@ class FormatGroup(click.Group):
         return name
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
-        """The command of a format; `UnknownNameError` suggests the closest name."""
+        """The command of a format; `RecipeError` suggests the closest name."""
         from acwm_formats.format import options_of
 
         component = _formats()[cmd_name]

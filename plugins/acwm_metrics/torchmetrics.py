@@ -128,7 +128,7 @@ def as_torchmetric(
         **params: constructor parameters, if `metric` is a name.
 
     Raises:
-        UnknownNameError, MissingExtraError: the metric, or something that it needs, is missing.
+        RecipeError, MissingExtraError: the metric, or something that it needs, is missing.
         PluginError: the metric needs a card or an estimator that is not given.
     """
     made = catalog().create("metric", metric, **params) if isinstance(metric, str) else metric

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.card import CARD, DatasetCard, package_versions
+from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
 from acwm_core.data.shards import shard_name, write_shard
@@ -17,7 +17,6 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec
-from acwm_core.errors import OtherDatasetError
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.videos import join, magnification, panels
 from acwm_core.files import held, writing
@@ -111,7 +110,7 @@ def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
     existing = DatasetCard.read(folder) if (folder / CARD).exists() else None
     count = existing.splits["train"] if existing else 0
     if existing and (differences := existing.differences(replace(new, splits=existing.splits))):
-        raise OtherDatasetError(folder, differences)
+        raise other_dataset(folder, differences)
     shards = folder / "train"
     shards.mkdir(exist_ok=True)
     episode = recording.episode(new.spec("train", count))

@@ -124,7 +124,7 @@ class Simulator:
         It is drawn once per scene, in a second environment, because drawing moves things.
 
         Raises:
-            UnknownNameError: the environment has no such task.
+            RecipeError: the environment has no such task.
             RecipeError: the scene has no goal that is not reached at its start.
         """
         goal_task: Task = catalog().component("environment", self._name).load_task(task)

@@ -49,7 +49,7 @@ def playable(
         frame_size: a side, or height and width; those of their data by default.
 
     Raises:
-        UnknownNameError: there is no such environment.
+        RecipeError: there is no such environment.
         TrainingError: there is nothing to play; the message says what to do.
         RecipeError: the simulator of a run's environment is not installed.
     """

@@ -11,7 +11,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import EpisodeSpec, Factor, FactorValue, Split
-from acwm_core.errors import DataError, OtherDatasetError, RecipeError
+from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
 from acwm_core.evaluation.interventions import simulator_of
@@ -126,20 +126,17 @@ def _generated(
     datasets: dict[str, EpisodeDataset] = {}
     for value in sweep.values:
         name = f"{sweep.factor.name}={value}"
-        try:
-            generate(
-                card.environment.name,
-                home / name,
-                episodes={SPLIT: count},
-                seed=card.seed,
-                size=card.environment.frame_size,
-                factors={**card.factors, sweep.factor.name: value},
-                workers=workers,
-                shard_episodes=4,  # so that few episodes keep several workers busy
-                progress=progress,
-            )
-        except OtherDatasetError as error:
-            raise DataError(f"{error.found}; delete {home} to generate it anew") from None
+        generate(
+            card.environment.name,
+            home / name,
+            episodes={SPLIT: count},
+            seed=card.seed,
+            size=card.environment.frame_size,
+            factors={**card.factors, sweep.factor.name: value},
+            workers=workers,
+            shard_episodes=4,  # so that few episodes keep several workers busy
+            progress=progress,
+        )
         datasets[name] = EpisodeDataset(home / name, SPLIT)
     return datasets
 

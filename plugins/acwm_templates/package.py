@@ -29,7 +29,7 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
 
     Raises:
         RecipeError: the name is invalid or taken, or the folder exists.
-        UnknownNameError: there is no such environment.
+        RecipeError: there is no such environment.
     """
     registers = KINDS[kind].registers
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():

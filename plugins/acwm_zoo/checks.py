@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.checks.result import Suite, expect, expect_is_a
-from acwm_core.errors import CheckpointError
+from acwm_core.errors import DataError
 from acwm_zoo.importer import CheckpointImporter, ForeignModel, convert, recipe_of
 
 STRANGERS: tuple[dict[str, Any], ...] = (
@@ -64,7 +64,7 @@ class ImporterChecks(Suite):
     def _is_needed(self, path: Path) -> bool:
         try:
             found = self._converted(_moved, path)
-        except CheckpointError:
+        except DataError:
             return True
         return any(not torch.equal(found[name], tensor) for name, tensor in self._whole.items())
 
@@ -86,11 +86,11 @@ class ImporterChecks(Suite):
         expect(not same, f"{', '.join(same[:3])} does not depend on the checkpoint")
 
     def names_what_is_missing(self) -> None:
-        """Refuse a checkpoint that lacks a tensor, with a `CheckpointError` that names it."""
+        """Refuse a checkpoint that lacks a tensor, with a `DataError` that names it."""
         self._expect_named(lambda tensor: None, "lacks")
 
     def names_what_has_another_shape(self) -> None:
-        """Refuse a tensor with an extra axis, with a `CheckpointError` that names it."""
+        """Refuse a tensor with an extra axis, with a `DataError` that names it."""
         self._expect_named(lambda tensor: tensor[None], "has another shape of")
 
     def _expect_named(self, change: Change, what: str) -> None:
@@ -98,7 +98,7 @@ class ImporterChecks(Suite):
             name = path[-1]
             try:
                 self._converted(change, path)
-            except CheckpointError as error:
+            except DataError as error:
                 words = re.findall(r"[\w.]+\w", str(error))
                 named = any(name.endswith(word) and "." in word for word in words)
                 expect(named, f"{error}: no {name}")

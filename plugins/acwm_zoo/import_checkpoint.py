@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from acwm_core.cli.arguments import FOLDER, OUT_FOLDER
-from acwm_core.errors import CheckpointError
+from acwm_core.errors import DataError
 
 
 @click.command("import-checkpoint")
@@ -33,7 +33,7 @@ def import_checkpoint(
     `acwm evaluate`, `acwm rollout` and `acwm fit … training.init_from=RUN` accept the run.
     """
     if not file.is_file():
-        raise CheckpointError(f"there is no file {file}")
+        raise DataError(f"there is no file {file}")
 
     from acwm_zoo.importing import import_checkpoint as run_import
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from acwm_core.errors import CheckpointError, PluginError
+from acwm_core.errors import DataError, PluginError
 from acwm_core.model.build import build_conditioner, build_model, build_objective
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
@@ -33,7 +33,7 @@ class ForeignModel:
         action_size: dimensions A of an action.
         step: number of optimiser steps of the weights; 0 if the checkpoint does not say.
         convert: takes the model and conditioner that the sections name, built on the meta device,
-            and returns their state dicts. Raises `CheckpointError` with the name of a tensor that
+            and returns their state dicts. Raises `DataError` with the name of a tensor that
             is missing, unexpected or of another shape.
         untold: parameters that an override must set because the weights do not reveal them: the
             reason by parameter, ``{"model.heads": "…"}``.
@@ -66,7 +66,7 @@ class CheckpointImporter(ABC):
                 tensors of a ``.safetensors`` file by name.
 
         Raises:
-            CheckpointError: it has this format, but something is missing or wrong.
+            DataError: it has this format, but something is missing or wrong.
         """
 
     @abstractmethod
@@ -82,13 +82,13 @@ def recipe_of(checkpoint: ForeignModel, overrides: Sequence[str]) -> Recipe:
 
     Raises:
         RecipeError: an override is wrong.
-        CheckpointError: an override is missing for a parameter that the checkpoint lacks.
+        DataError: an override is missing for a parameter that the checkpoint lacks.
     """
     told = with_overrides({}, overrides)
     for name, reason in checkpoint.untold.items():
         section, _, parameter = name.partition(".")
         if parameter not in told.get(section, {}):
-            raise CheckpointError(f"{reason}: add the override {name}=…")
+            raise DataError(f"{reason}: add the override {name}=…")
     environment = told.get("env", {}).get("name")
     data = {"path": f"data/{environment or 'mine'}", **checkpoint.sections.get("data", {})}
     usual = {"evaluation": read_recipe(recipe_folder() / "base.yaml")["evaluation"]}
@@ -100,7 +100,7 @@ def convert(checkpoint: ForeignModel, recipe: Recipe) -> State:
     """The weights under the names of a `WorldModel`, in float32.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected or of another shape.
+        DataError: a tensor is missing, unexpected or of another shape.
         PluginError: the importer's state dicts do not fit the model and conditioner.
     """
     with torch.device("meta"):
@@ -119,6 +119,6 @@ def convert(checkpoint: ForeignModel, recipe: Recipe) -> State:
             if name not in state or state[name].shape != expected.shape:
                 raise PluginError(f"the importer gives the {prefix} no {name} of its shape")
             if not state[name].isfinite().all():
-                raise CheckpointError(f"weights of {prefix}.{name} are not finite: it diverged")
+                raise DataError(f"weights of {prefix}.{name} are not finite: it diverged")
             weights[f"{prefix}.{name}"] = state[name].float()
     return weights

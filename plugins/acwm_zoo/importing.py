@@ -16,7 +16,7 @@ import safetensors.torch
 from acwm_core.data.card import CARD, DatasetCard, package_versions
 from acwm_core.data.remote import data_folder
 from acwm_core.env.environment import EnvironmentCard, resolve_size
-from acwm_core.errors import AcwmError, CheckpointError, DataError, PluginError, TrainingError
+from acwm_core.errors import AcwmError, DataError, PluginError, TrainingError
 from acwm_core.files import load_plain, written_whole
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
@@ -55,7 +55,7 @@ def import_checkpoint(
         importer: name of the registered importer; by default the one that knows the format.
 
     Raises:
-        CheckpointError: the file is missing or damaged, holds code or has a format that no importer
+        DataError: the file is missing or damaged, holds code or has a format that no importer
             knows, or a tensor is missing, unexpected or of another shape.
         TrainingError: `out` already holds a run.
         RecipeError: an override is wrong.
@@ -95,10 +95,10 @@ def _read_checkpoint(path: Path, importer: str | None) -> ForeignModel:
     content = _content(path)
     models = [model for reader in readers if (model := reader.read(content))]
     if len(models) > 1:
-        raise CheckpointError(f"{path} may be one of several formats: say which by --importer")
+        raise DataError(f"{path} may be one of several formats: say which by --importer")
     if not models:
         names = " or ".join(each.name for each in importers)
-        raise CheckpointError(
+        raise DataError(
             f"{path} is not a checkpoint that {names} knows; it holds "
             f"{', '.join(map(str, list(content)[:5])) or 'nothing'}"
         )
@@ -110,12 +110,10 @@ def _content(path: Path) -> Mapping[str, Any]:
         if path.suffix == ".safetensors":
             return cast(Any, safetensors.torch).load_file(path)
         content = load_plain(path, on_disk=True)
-    except DataError as error:
-        raise CheckpointError(str(error)) from error
     except (OSError, safetensors.SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be read: {error}") from error
+        raise DataError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, Mapping):
-        raise CheckpointError(f"{path} holds a {type(content).__name__}, no checkpoint")
+        raise DataError(f"{path} holds a {type(content).__name__}, no checkpoint")
     return cast(Mapping[str, Any], content)
 
 
@@ -159,13 +157,13 @@ def _card(recipe: Recipe, action_size: int, checkpoint: Path) -> DatasetCard:
     return card
 
 
-def _untold_actions(action_size: int) -> CheckpointError:
+def _untold_actions(action_size: int) -> DataError:
     fitting: list[str] = []
     for each in catalog().registry("environment"):
         with contextlib.suppress(AcwmError, ImportError, AttributeError):  # skip failures
             if each.load().card.action.size == action_size:
                 fitting.append(f"env={each.name}")
-    return CheckpointError(
+    return DataError(
         f"the checkpoint takes actions of size {action_size} and does not say what they mean: "
         f"add data.path=FOLDER{' or one of ' if fitting else ''}{', '.join(fitting)}"
     )

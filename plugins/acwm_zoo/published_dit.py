@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from acwm_core.errors import CheckpointError
+from acwm_core.errors import DataError
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
 from acwm_dit.adaln import AdaLN
@@ -114,7 +114,7 @@ def _network(state: Mapping[str, Any]) -> dict[str, Tensor]:
         if name.startswith(ASIDE):
             continue
         if not name.startswith(NETWORK) or not isinstance(value, Tensor):
-            raise CheckpointError(
+            raise DataError(
                 f"the checkpoint holds {name!r}, not a tensor of {NETWORK}* or of "
                 f"{', '.join(f'{prefix}*' for prefix in ASIDE)}"
             )
@@ -124,10 +124,10 @@ def _network(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ...]:
     if name not in weights:
-        raise CheckpointError(f"the checkpoint lacks {name}")
+        raise DataError(f"the checkpoint lacks {name}")
     shape = tuple(weights[name].shape)
     if len(shape) != axes:
-        raise CheckpointError(f"{name} has shape {shape} in the checkpoint, not {axes} axes")
+        raise DataError(f"{name} has shape {shape} in the checkpoint, not {axes} axes")
     return shape
 
 
@@ -135,7 +135,7 @@ def _convert(
     weights: Mapping[str, Tensor], model: DynamicsModel, conditioner: Conditioner
 ) -> tuple[State, State]:
     if not isinstance(model, DiT) or not isinstance(conditioner, (AdaLN, CrossAttention)):
-        raise CheckpointError(
+        raise DataError(
             "published ACWM-DiT weights are for a DiT with the conditioner adaln or "
             "cross_attention: leave out the words model=… and conditioner=…"
         )

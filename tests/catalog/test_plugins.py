@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from acwm_core.errors import MissingExtraError, PluginError, UnknownNameError, suggest
+from acwm_core.errors import MissingExtraError, PluginError, RecipeError, suggest
 from acwm_core.plugins import Registry, hookimpl
 from tests.catalog.installing import REFERENCE, Install, loaded, reasons, unharmed
 
@@ -164,8 +164,8 @@ def test_a_failed_late_registration_can_be_repeated() -> None:
 
 
 def test_unknown_names_suggest_the_nearest() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'push_cube'"):
+    with pytest.raises(RecipeError, match="did you mean 'push_cube'"):
         REFERENCE.component("environment", "push_cub")
-    with pytest.raises(UnknownNameError, match=r"unknown codec 'zzz'; known: .*compact"):
+    with pytest.raises(RecipeError, match=r"unknown codec 'zzz'; known: .*compact"):
         REFERENCE.component("codec", "zzz")
     assert suggest("place", ["palace", "push_cube.place"]) == "; did you mean 'push_cube.place'?"

@@ -14,7 +14,7 @@ from acwm_core.checks.task import TaskChecks
 from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
-from acwm_core.errors import UnknownNameError
+from acwm_core.errors import RecipeError
 from tests.checks.flawed import FLAWS
 from tests.checks.results import failures, in_words, with_variants_slow
 from tests.episodes import assert_same
@@ -89,5 +89,5 @@ def test_what_cannot_be_tried_is_told():
 
 
 def test_unknown_environments_are_named_at_once():
-    with pytest.raises(UnknownNameError, match="unknown environment 'push_cubes'"):
+    with pytest.raises(RecipeError, match="unknown environment 'push_cubes'"):
         check_environment("push_cubes")

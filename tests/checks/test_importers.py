@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from acwm_core.checks.result import checks_of
-from acwm_core.errors import CheckpointError
+from acwm_core.errors import DataError
 from acwm_zoo.checks import ImporterChecks, check_importer
 from acwm_zoo.published_dit import PublishedCheckpoint
 from tests.checks.results import Flaws, failures, installed
@@ -67,14 +67,14 @@ class SaysOnlyThatItIsDamaged(Changed):
     def read(self, content):
         try:
             return super().read(content)
-        except CheckpointError:
-            raise CheckpointError("the checkpoint is damaged") from None
+        except DataError:
+            raise DataError("the checkpoint is damaged") from None
 
     def converted(self, found, model, conditioner):
         try:
             return found.convert(model, conditioner)
-        except CheckpointError:
-            raise CheckpointError("the checkpoint is damaged") from None
+        except DataError:
+            raise DataError("the checkpoint is damaged") from None
 
 
 @FLAWS.caught_by("names what has another shape", "has another shape of")

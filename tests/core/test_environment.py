@@ -12,7 +12,7 @@ from acwm_core.env.environment import (
     resolve_size,
 )
 from acwm_core.env.episode import Episode, EpisodeSpec, Factor, draw_factors, ood_label
-from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors import AcwmError, RecipeError, ShapeError
 
 GAIN = Factor.continuous(
     "gain", "speed", train=(0.5, 1.0), ood=((1.5, 2.0), (0.1, 0.2)), nominal=0.75, active=True
@@ -69,7 +69,7 @@ def test_vector_environments_hold_what_differs_between_their_members():
 
 def test_an_action_of_an_unknown_kind_is_refused():
     """Else a dataset would be written that nobody can read."""
-    with pytest.raises(ActionError, match="absolute, delta, torque, not 'force'"):
+    with pytest.raises(ShapeError, match="absolute, delta, torque, not 'force'"):
         ActionSpec(("x",), ("N",), (-1.0,), (1.0,), "force")
 
 
@@ -87,12 +87,12 @@ def test_an_episode_is_truncated_at_the_horizon():
 def test_bad_actions_are_refused(action, sentence):
     env = Point()
     env.reset(seed=0)
-    with pytest.raises(ActionError, match=sentence):
+    with pytest.raises(ShapeError, match=sentence):
         env.step(np.array(action))
 
 
 def test_step_before_reset_says_what_to_do():
-    with pytest.raises(ActionError, match="reset"):
+    with pytest.raises(AcwmError, match="reset"):
         Point().step(np.zeros(2))
 
 

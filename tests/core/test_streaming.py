@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Cache
@@ -150,7 +150,7 @@ def test_wrong_actions_are_refused_and_disturb_nothing():
         (actions(4) * float("nan"), "not finite"),
         (actions(4) + 5, r"out of its bounds \[-2, 2\]: clip it"),
     ):
-        with pytest.raises(ActionError, match=sentence):
+        with pytest.raises(ShapeError, match=sentence):
             stream.step(wrong)
     with pytest.raises(ShapeError, match=r"actions are \[B, T, A\]"):
         next(stream.play(actions(4)[0]))
@@ -160,7 +160,7 @@ def test_wrong_actions_are_refused_and_disturb_nothing():
 def test_wrong_actions_between_given_frames_are_refused():
     world, given = small_world(), torch.rand(2, 5, 3, 16, 16)
     world.stream(given, actions(4))
-    with pytest.raises(ActionError, match="not finite"):
+    with pytest.raises(ShapeError, match="not finite"):
         world.stream(given, actions(4) * float("nan"))
     for wrong in (actions(3), actions(4, batch=1)):
         with pytest.raises(ShapeError, match=r"between 5 frames there are actions \[2, 4, 'A'\]"):

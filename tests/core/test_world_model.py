@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from acwm_core.errors import ActionError, RecipeError, ShapeError
+from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
@@ -154,7 +154,7 @@ def test_a_short_training_learns_what_actions_do(objective):
 
 def test_wrong_shapes_are_refused_with_a_sentence():
     world = tiny_world_model()
-    with pytest.raises(ActionError, match="2 action dimensions, not 3"):
+    with pytest.raises(ShapeError, match="2 action dimensions, not 3"):
         world.rollout(first_frame(), actions(size=3))
     with pytest.raises(ShapeError, match="1 first frames for 2"):
         world.rollout(first_frame(1), actions())
@@ -173,11 +173,11 @@ def test_wrong_shapes_are_refused_with_a_sentence():
 
 
 WRONG_ACTIONS = [
-    (lambda rows: rows * float("nan"), ActionError, "not finite"),
-    (lambda rows: rows.index_fill(1, torch.tensor([1]), float("inf")), ActionError, "not finite"),
-    (lambda rows: rows + torch.tensor([0.0, 4.1]), ActionError, r"dimension 1 .* \[-2, 2\]: clip"),
-    (lambda rows: rows - torch.tensor([4.1, 0.0]), ActionError, r"dimension 0 .* \[-2, 2\]: clip"),
-    (lambda rows: rows[..., :1], ActionError, "2 action dimensions, not 1"),
+    (lambda rows: rows * float("nan"), ShapeError, "not finite"),
+    (lambda rows: rows.index_fill(1, torch.tensor([1]), float("inf")), ShapeError, "not finite"),
+    (lambda rows: rows + torch.tensor([0.0, 4.1]), ShapeError, r"dimension 1 .* \[-2, 2\]: clip"),
+    (lambda rows: rows - torch.tensor([4.1, 0.0]), ShapeError, r"dimension 0 .* \[-2, 2\]: clip"),
+    (lambda rows: rows[..., :1], ShapeError, "2 action dimensions, not 1"),
 ]
 
 

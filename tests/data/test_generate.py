@@ -20,7 +20,7 @@ from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.generate import ShardTask, generate, make_shard, parse_episodes
 from acwm_core.data.shards import open_shard
 from acwm_core.data.simulate import simulated
-from acwm_core.errors import DataError, RecipeError, UnknownNameError
+from acwm_core.errors import DataError, RecipeError
 from acwm_core.executors import LocalExecutor, progress_bar
 from acwm_core.files import alone, held
 from acwm_core.plugins import catalog
@@ -228,7 +228,7 @@ def test_impossible_requests_are_refused_before_anything_is_made(tmp_path):
         ({"workers": -2}, "workers cannot be -2"),
         ({"shard_episodes": 0}, "shard_episodes"),
     ):
-        with pytest.raises((RecipeError, UnknownNameError), match=message):
+        with pytest.raises((RecipeError, RecipeError), match=message):
             make(out, **change)
     assert not out.exists()
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,16 @@ def die_once(marker, report):
 
 def fail(task, report):
     raise DataError(f"task {task} is impossible")
+
+
+def path_of_worker(task, report):
+    return sys.path
+
+
+def test_workers_import_nothing_from_the_working_folder(address, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (path,) = RayExecutor(address=address).run(path_of_worker, [0], print)
+    assert str(tmp_path) not in path
 
 
 def test_two_nodes_share_the_tasks_and_report_them(address, tmp_path):

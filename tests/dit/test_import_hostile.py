@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from acwm_core.errors import CheckpointError, DataError, PluginError, RecipeError
+from acwm_core.errors import DataError, PluginError, RecipeError
 from acwm_core.plugins import catalog
 from acwm_zoo.importing import import_checkpoint
 from tests.dit.latest import WORDS, content, writer
@@ -22,7 +22,7 @@ def latest(tmp_path):
 def test_pickled_code_is_not_run(zipped, latest, tmp_path):
     mark = tmp_path / "mark"
     path = latest({**content(), "config": Attack(mark)}, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(CheckpointError, match="nothing in it was run"):
+    with pytest.raises(DataError, match="nothing in it was run"):
         import_checkpoint(path, tmp_path / "run", WORDS)
     assert not mark.exists()
     assert not (tmp_path / "run").exists()
@@ -51,7 +51,7 @@ def test_numbers_of_numpy_and_old_files_are_read(latest, tmp_path):
     ],
 )
 def test_a_wrong_tensor_is_named(changes, message, latest, tmp_path):
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(DataError, match=message):
         import_checkpoint(latest(content(**changes)), tmp_path / "run", WORDS)
     assert not (tmp_path / "run").exists()
 
@@ -59,19 +59,19 @@ def test_a_wrong_tensor_is_named(changes, message, latest, tmp_path):
 def test_an_entry_beside_the_network_is_named(latest, tmp_path):
     values = content()
     values["model_state_dict"]["discriminator.weight"] = torch.zeros(2)
-    with pytest.raises(CheckpointError, match=r"'discriminator\.weight'"):
+    with pytest.raises(DataError, match=r"'discriminator\.weight'"):
         import_checkpoint(latest(values), tmp_path / "run", WORDS)
 
 
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (("env=push_cube",), CheckpointError, "heads: add the override model.heads="),
-        (("model.heads=4",), CheckpointError, "data.path=FOLDER or one of .*env=push_cube"),
+        (("env=push_cube",), DataError, "heads: add the override model.heads="),
+        (("model.heads=4",), DataError, "data.path=FOLDER or one of .*env=push_cube"),
         (("model.heads=4", "env=stack_cube"), DataError, "size 2, and those of stack_cube have 7"),
         (("model.heads=5", "env=push_cube"), RecipeError, "5 heads"),
-        ((*WORDS, "conditioner=cross_attention"), CheckpointError, "convolutional"),
-        ((*WORDS, "model.layers=3"), CheckpointError, r"lacks blocks\.2"),
+        ((*WORDS, "conditioner=cross_attention"), DataError, "convolutional"),
+        ((*WORDS, "model.layers=3"), DataError, r"lacks blocks\.2"),
         ((*WORDS, "model.depth=3"), RecipeError, "no parameter 'depth'"),
         (("model.heads=4", "data.path=nowhere"), DataError, "no dataset in nowhere"),
     ],
@@ -94,19 +94,19 @@ def test_wrong_words_are_refused(words, error, message, latest, tmp_path):
     ],
 )
 def test_other_files_are_refused(values, message, latest, tmp_path):
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(DataError, match=message):
         import_checkpoint(latest(values), tmp_path / "run", WORDS)
 
 
 def test_damaged_and_missing_files_are_refused(latest, tmp_path):
     path = latest(content())
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(CheckpointError, match="damaged"):
+    with pytest.raises(DataError, match="damaged"):
         import_checkpoint(path, tmp_path / "run", WORDS)
-    with pytest.raises(CheckpointError, match="is missing"):
+    with pytest.raises(DataError, match="is missing"):
         import_checkpoint(tmp_path / "nothing.pt", tmp_path / "run", WORDS)
     save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
-    with pytest.raises(CheckpointError, match="it holds weight"):
+    with pytest.raises(DataError, match="it holds weight"):
         import_checkpoint(tmp_path / "other.safetensors", tmp_path / "run", WORDS)
 
 
@@ -117,7 +117,7 @@ Broken = plugin_of(
 
 def test_broken_environments_hide_none_that_fit(fresh_catalog, latest, tmp_path):
     catalog().add_plugin(Broken, "broken")
-    with pytest.raises(CheckpointError, match=r"one of .*env=push_cube"):
+    with pytest.raises(DataError, match=r"one of .*env=push_cube"):
         import_checkpoint(latest(content()), tmp_path / "run", ("model.heads=4",))
 
 

@@ -10,7 +10,7 @@ from safetensors import safe_open
 from acwm_dit.adaln import AdaLN
 from acwm_dit.cross_attention import CrossAttention
 from acwm_dit.dit import DiT
-from acwm_dit.published import CheckpointError, convert
+from acwm_dit.published import DataError, convert
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 CASES = {
@@ -103,19 +103,19 @@ def test_a_wrong_checkpoint_names_the_tensor(damage, message):
     _, weights, model, conditioner = load("acwm_dit_adaln_bidirectional")
     weights |= damage
     weights = {name: tensor for name, tensor in weights.items() if tensor is not None}
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(DataError, match=message):
         convert(weights, model, conditioner)
 
 
 def test_the_other_conditioner_is_refused():
     _, weights, model, _ = load("acwm_dit_adaln_bidirectional")
     _, _, _, conditioner = load("acwm_dit_crossattn_causal")
-    with pytest.raises(CheckpointError, match=r"lacks blocks\.0\.action_cross_attn"):
+    with pytest.raises(DataError, match=r"lacks blocks\.0\.action_cross_attn"):
         convert(weights, model, conditioner)
 
 
 def test_stacked_actions_are_refused():
     _, weights, model, _ = load("acwm_dit_adaln_bidirectional")
     conditioner = AdaLN(action_size=2, temporal_stride=4, width=64, layers=2, heads=4)
-    with pytest.raises(CheckpointError, match="embedding=convolutional"):
+    with pytest.raises(DataError, match="embedding=convolutional"):
         convert(weights, model, conditioner)

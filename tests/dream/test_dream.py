@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import acwm
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
-from acwm_core.errors import ActionError, AcwmError, RecipeError
+from acwm_core.errors import AcwmError, RecipeError, ShapeError
 from acwm_dream.environment import Dream
 from tests.planning import tiny
 from tests.policies import slide
@@ -199,13 +199,13 @@ def test_what_cannot_be_had_is_told_in_a_sentence(run, settings, message):
 
 def test_actions_are_checked(run):
     env = dream(run).unwrapped
-    with pytest.raises(ActionError, match=r"call reset\(\) before step"):
+    with pytest.raises(AcwmError, match=r"call reset\(\) before step"):
         env.step(np.zeros(2, np.float32))
     env.reset(seed=0)
     for wrong, message in [([9, 0], "out of its bounds"), ([np.nan, 0], "not finite")]:
-        with pytest.raises(ActionError, match=message):
+        with pytest.raises(ShapeError, match=message):
             env.step(np.array(wrong, np.float32))
-    with pytest.raises(ActionError, match="2 action dimensions"):
+    with pytest.raises(ShapeError, match="2 action dimensions"):
         env.step(np.zeros(3, np.float32))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import acwm
-from acwm_core.errors import ActionError, AcwmError
+from acwm_core.errors import AcwmError, ShapeError
 from tests.planning import tiny
 from tests.policies import slide
 
@@ -83,12 +83,12 @@ def test_spaces_and_seeds(run):
 
 def test_what_cannot_be(run):
     many = dreams(run, 2)
-    with pytest.raises(ActionError, match="call reset"):
+    with pytest.raises(AcwmError, match="call reset"):
         many.step(np.zeros((2, 2), np.float32))
     with pytest.raises(AcwmError, match="3 seeds for 2"):
         many.reset(seed=[1, 2, 3])
     many.reset(seed=0)
-    with pytest.raises(ActionError, match=r"\(2, 2\), not \(3, 2\)"):
+    with pytest.raises(ShapeError, match=r"\(2, 2\), not \(3, 2\)"):
         many.step(np.zeros((3, 2), np.float32))
     with pytest.raises(AcwmError, match="num_envs=0"):
         dreams(run, 0)

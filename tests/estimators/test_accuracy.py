@@ -12,7 +12,7 @@ import torch
 from acwm_core.checks.disc import Disc
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
-from acwm_core.errors import DataError, ShapeError, UnknownNameError
+from acwm_core.errors import DataError, RecipeError, ShapeError
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.files import training_record
 from acwm_core.plugins import catalog
@@ -131,7 +131,7 @@ def test_joint_angles_are_those_of_the_points():
 
 def test_an_unknown_environment_has_no_estimator():
     assert estimator_for(Disc.card) is None
-    with pytest.raises(UnknownNameError, match="unknown estimator 'disc'"):
+    with pytest.raises(RecipeError, match="unknown estimator 'disc'"):
         Estimator(Disc.card)
 
 

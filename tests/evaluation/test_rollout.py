@@ -8,7 +8,7 @@ from PIL import Image
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
-from acwm_core.errors import ActionError, AcwmWarning, DataError, RecipeError
+from acwm_core.errors import AcwmWarning, DataError, RecipeError, ShapeError
 from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import _read_actions, frame_strip, rollout_run
@@ -169,7 +169,7 @@ def test_wrong_requests_are_refused(evaluated, tmp_path):
         (np.full((4, 2), np.nan), "bounds"),
     ):
         np.save(rows, wrong)
-        with pytest.raises(ActionError, match=error):
+        with pytest.raises(ShapeError, match=error):
             rollout_run(evaluated, video, actions=rows)
     (tmp_path / "first.png").write_text("no picture")
     with pytest.raises(DataError, match="picture"):
@@ -193,5 +193,5 @@ def test_actions_at_their_bounds_are_accepted(kind, tmp_path):
     read = _read_actions(tmp_path / "actions.npy", spec)
     np.testing.assert_array_equal(read[:2], rows.astype(np.float32))
     np.save(tmp_path / "actions.npy", rows * 1.001)
-    with pytest.raises(ActionError, match="outside their bounds"):
+    with pytest.raises(ShapeError, match="outside their bounds"):
         _read_actions(tmp_path / "actions.npy", spec)

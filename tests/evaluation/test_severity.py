@@ -231,13 +231,9 @@ def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
     run = shutil.copytree(swept[0], tmp_path / "run")
     other = tmp_path / "other"
     generate("drift", other, episodes={"ind_test": 1}, seed=1, workers=0, progress=False)
-    with pytest.raises(DataError) as error:
-        sweep(run, data=other)
     home = run / "evaluation" / "severity" / "3-episodes"
-    assert str(error.value) == (
-        f"{home / 'colour=200'} holds another dataset: seed is 0 there, 1 now; "
-        f"delete {home} to generate it anew"
-    )
+    with pytest.raises(DataError, match=f"{home / 'colour=200'} holds another.*: seed is 0 there"):
+        sweep(run, data=other)
     shutil.rmtree(home)
     assert sweep(run, data=other).provenance["dataset"]["seed"] == 1
 

@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.errors import RecipeError
 from acwm_core.plugins import Catalog, Problem
 from acwm_core.recipe import compose, recipe_names
 from tests.plugins import plugin_of
@@ -42,7 +42,7 @@ def test_an_unknown_name_tells_of_plugins_that_were_left_out():
     catalog = Catalog()
     catalog.add_plugin(plugin_of(codecs={"fine": "somewhere:Fine"}), "whole")
     catalog.problems.append(Problem("acwm_broken", "No module named 'nonsuch'"))
-    with pytest.raises(UnknownNameError, match=r"'acwm_broken' was left out: No module named"):
+    with pytest.raises(RecipeError, match=r"'acwm_broken' was left out: No module named"):
         catalog.component("codec", "mine")
     assert catalog.component("codec", "fine").target == "somewhere:Fine"
 

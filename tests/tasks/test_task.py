@@ -14,7 +14,7 @@ from acwm_core.cli.main import main
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task, TaskEnvironment, observed
-from acwm_core.errors import RecipeError, UnknownNameError
+from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog, hookimpl
 from tests.tasks.playing import begin, make, solve, spec_of
 
@@ -154,7 +154,7 @@ def test_failure_in_a_frame_spoils_those_that_follow_in_a_clip(reacher):
     ],
 )
 def test_an_unknown_task_is_one_sentence(environment, task, message):
-    with pytest.raises(UnknownNameError) as caught:
+    with pytest.raises(RecipeError) as caught:
         gymnasium.make(f"acwm/{environment}-v0", task=task)
     assert str(caught.value) == message
 

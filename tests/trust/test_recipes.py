@@ -70,6 +70,7 @@ def test_a_recipe_chooses_no_folder_to_write_to(tmp_path):
         {"trainer": {"plugins": [CODE]}},
         {"trainer": {"profiler": "evil.Profiler"}},
         {"trainer": {"strategy": "evil.Strategy"}},
+        {"trainer": {"callbacks": r'[{"class_path": "evil\u002eX"}]'}},  # Lightning parses it
         {"evaluation": {"metrics": [METRIC]}},
         {"evaluation": {"metrics": ["psnr"], "metric_options": {"torchmetrics": METRIC}}},
         {"evaluation": {"metric_options": {"fvd": {"detector": "program.pt"}}}},
@@ -174,12 +175,13 @@ def test_no_child_imports_from_the_working_folder(tmp_path):
 
 
 def test_usual_flags_are_no_code(tmp_path):
-    flags = {"max_steps": 3, "devices": [0], "strategy": "ddp", "max_time": "00:00:01:00"}
+    flags = {"devices": "0,1", "strategy": "ddp", "precision": "bf16-mixed"}
+    flags |= {"gradient_clip_val": "0.5", "max_time": {"hours": 1}}
     metrics = ["psnr", "torchmetrics.image.SpectralAngleMapper"]  # of a library that is installed
     recipe = extended(
         tmp_path / "mine.yaml", RUN / "recipe.yaml", trainer=flags, evaluation={"metrics": metrics}
     )
-    assert compose(recipe).trainer["max_time"] == "00:00:01:00"
+    assert compose(recipe).trainer["max_time"] == {"hours": 1}
 
 
 @pytest.mark.parametrize(
