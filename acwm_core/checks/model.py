@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import torch
@@ -23,8 +23,8 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Cache, Denoiser, DynamicsModel, LatentStream, Predictor
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
-from acwm_core.model.objectives.flow import drawn_noise, evaluation
-from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.flow import evaluation
+from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.shapes import Actions, Latent, Tokens
 
@@ -111,9 +111,8 @@ class DynamicsChecks(Suite):
 
     @torch.no_grad()
     def _predict(self, given: Latent, modulation: Tensor, probe: Probe | None = None) -> Latent:
-        conditioning = self._conditioning(modulation, probe)
-        generators = draws(len(given))
-        return self._objective.predict(self._model, given, conditioning, SHAPE[1], generators)
+        batch = Batch(given, self._conditioning(modulation, probe), draws(len(given)))
+        return self._objective.predict(self._model, batch, SHAPE[1])
 
     @property
     def is_denoiser(self) -> bool:
@@ -147,7 +146,8 @@ class DynamicsChecks(Suite):
         latents, modulation = self._inputs()
         conditioning, generators = self._conditioning(modulation), draws(len(latents))
         for known in (2, 1):
-            loss = self._objective.loss(self._model, latents, conditioning, generators, known)
+            batch = Batch(latents, conditioning, generators)
+            loss = self._objective.loss(self._model, batch, known)
             expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
             idle = without_gradient(self._model, loss)
             expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
@@ -257,31 +257,20 @@ class DenoisingTrial(DiffusionForcing):
 
     causal = False
 
-    def loss(
-        self,
-        model: Denoiser,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
         """See `Objective.loss`."""
-        evaluate = evaluation(model, conditioning, **further_inputs(model, *latents.shape))
-        return self.error(evaluate, latents, generators, known)
+        inputs = further_inputs(model, *batch.latents.shape)
+        evaluate = evaluation(model, batch.conditioning, **inputs)
+        return self.error(evaluate, batch.latents, batch.generators, known)
 
     def predict(
-        self,
-        model: Denoiser,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
+        self, model: Denoiser, given: Batch, frames: int, steps: int | None = None
     ) -> Latent:
         """See `Objective.predict`."""
-        shape = (len(given), frames, *given.shape[2:])
-        evaluate = evaluation(model, conditioning, **further_inputs(model, *shape))
-        return self.sample(evaluate, drawn_noise(shape[1:], generators), given, steps)
+        batch, _, *size = given.latents.shape
+        inputs = further_inputs(model, batch, frames, *size)
+        evaluate = evaluation(model, given.conditioning, **inputs)
+        return self.sample(evaluate, given.noise(frames), given.latents, steps)
 
 
 def further_inputs(model: Denoiser, batch: int, frames: int, *size: int) -> dict[str, Tensor]:
@@ -294,9 +283,9 @@ def further_inputs(model: Denoiser, batch: int, frames: int, *size: int) -> dict
     }
 
 
-def draws(batch: int) -> list[torch.Generator]:
-    """A generator for each clip of a batch."""
-    return [torch.Generator().manual_seed(seed) for seed in range(batch)]
+def draws(batch: int, first: int = 0) -> list[torch.Generator]:
+    """A generator for each clip of a batch, seeded by its number from `first` on."""
+    return [torch.Generator().manual_seed(first + clip) for clip in range(batch)]
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from acwm_core.model.dynamics import (
     LatentStream,
     Predictor,
 )
-from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Latent, Sigmas
 
 BATCH, FRAMES, CHANNELS, SIDE = 2, 5, 2, 4
@@ -49,25 +49,18 @@ class ObjectiveChecks(Suite):
         denoises = issubclass(self._objective.trains, Denoiser)
         return TinyDenoiser(self._objective.inputs) if denoises else TinyPredictor()
 
-    def _clips(self, batch: int = BATCH, seed: int = 1) -> tuple[Latent, Conditioning]:
+    def _clips(self, batch: int = BATCH, seed: int = 1, draw: int = 0) -> Batch:
         """Latents `[B, L, C, h, w]` that move by the modulation `[B, L, D]` of their actions."""
         actions = noise((batch, FRAMES, WIDTH), seed)
         start = noise((batch, 1, CHANNELS, SIDE, SIDE), seed + 1)
         moves = actions[:, :, :CHANNELS].cumsum(1) - actions[:, :1, :CHANNELS]
-        return start + 0.5 * moves[..., None, None], Conditioning(actions, None, Probe())
-
-    def _loss(
-        self, model: DynamicsModel, clips: tuple[Latent, Conditioning], first: int = 0
-    ) -> Tensor:
-        generators = draws(first + len(clips[0]))[first:]
-        return self._objective.loss(model, *clips, generators, 1)
+        latents = start + 0.5 * moves[..., None, None]
+        return Batch(latents, Conditioning(actions, None, Probe()), draws(batch, draw))
 
     @torch.no_grad()
     def _predict(self, batch: int = BATCH, steps: int | None = None, known: int = 1) -> Latent:
-        latents, conditioning = self._clips()
-        own = Conditioning(_rows(conditioning, 0, batch), None, Probe())
-        given = latents[:batch, :known]
-        return self._objective.predict(self._model(), given, own, FRAMES, draws(batch), steps)
+        given = _part(self._clips(), slice(batch), known)
+        return self._objective.predict(self._model(), given, FRAMES, steps)
 
     def can_be_constructed(self) -> None:
         """Construct the objective and find `trains`, `causal`, `inputs` and `steps`."""
@@ -98,7 +91,7 @@ class ObjectiveChecks(Suite):
 
     def the_loss_is_a_finite_number(self) -> None:
         """Return a finite scalar with a gradient."""
-        loss = self._loss(self._model(), self._clips())
+        loss = self._objective.loss(self._model(), self._clips(), 1)
         expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
         expect(loss.requires_grad, "no gradient reaches the model")
 
@@ -109,32 +102,21 @@ class ObjectiveChecks(Suite):
         for seed in (1, 2):
             model = self._model()
             cast(Any, torch).manual_seed(seed)
-            losses.append(self._loss(model, self._clips()).item())
-            latents, conditioning = self._clips()
+            losses.append(self._objective.loss(model, self._clips(), 1).item())
+            given = _part(self._clips(), slice(BATCH), 1)
             cast(Any, torch).manual_seed(seed)
             with torch.no_grad():
-                predictions.append(
-                    self._objective.predict(
-                        model, latents[:, :1], conditioning, FRAMES, draws(BATCH)
-                    )
-                )
+                predictions.append(self._objective.predict(model, given, FRAMES))
         expect(losses[0] == losses[1], "the loss depends on torch's own random numbers")
         same = torch.equal(*predictions)
         expect(same, "predictions depend on torch's own random numbers")
 
     def clips_of_a_batch_are_independent(self) -> None:
         """Average the loss over clips, and predict a clip the same way beside any others."""
-        model, (latents, conditioning) = self._model(), self._clips()
-        whole = self._loss(model, (latents, conditioning)).item()
+        model = self._model()
+        whole = self._objective.loss(model, self._clips(), 1).item()
         alone = [
-            self._loss(
-                model,
-                (
-                    latents[k : k + 1],
-                    Conditioning(_rows(conditioning, k, k + 1), None, Probe()),
-                ),
-                first=k,
-            ).item()
+            self._objective.loss(model, _part(self._clips(), slice(k, k + 1), FRAMES), 1).item()
             for k in range(BATCH)
         ]
         mean = sum(alone) / BATCH
@@ -147,19 +129,19 @@ class ObjectiveChecks(Suite):
         """Train a tiny model so that the loss on other clips falls."""
         model = self._model()
         optimizer: Any = torch.optim.Adam(model.parameters(), 1e-2)
-        before = self._loss(model, self._clips(32, seed=500)).item()
+        before = self._objective.loss(model, self._clips(32, seed=500), 1).item()
         for lesson in range(LESSONS):
             optimizer.zero_grad()
-            generators = [torch.Generator().manual_seed(lesson * 16 + k) for k in range(16)]
-            loss: Any = self._objective.loss(model, *self._clips(16, lesson * 2), generators, 1)
+            batch = self._clips(16, lesson * 2, draw=lesson * 16)
+            loss: Any = self._objective.loss(model, batch, 1)
             loss.backward()
             optimizer.step()
-        after = self._loss(model, self._clips(32, seed=500)).item()
+        after = self._objective.loss(model, self._clips(32, seed=500), 1).item()
         expect(after < before, f"the loss goes from {before:.3g} to {after:.3g} in training")
 
     def keeps_the_given_frames(self) -> None:
         """Predict finite latents of the requested length; 1 or 2 given frames stay unchanged."""
-        latents, _ = self._clips()
+        latents = self._clips().latents
         for known in (1, 2):
             predicted = self._predict(known=known)
             expect_equal("predicts", [*predicted.shape], [*latents.shape])
@@ -176,7 +158,8 @@ class ObjectiveChecks(Suite):
 
     def streams_or_refuses_to(self) -> None:
         """Stream finite frames after 1 or 2 given ones, or refuse to with a `RecipeError`."""
-        (latents, conditioning), model = self._clips(), self._model()
+        clips, model = self._clips(), self._model()
+        latents, conditioning = clips.latents, clips.conditioning
         for known in (1, 2):
             given = latents[:, :known]
             try:
@@ -191,9 +174,12 @@ class ObjectiveChecks(Suite):
             expect(streamed.isfinite().all(), "a streamed frame is not finite")
 
 
-def _rows(conditioning: Conditioning, start: int, stop: int) -> Tensor:
-    assert conditioning.modulation is not None
-    return conditioning.modulation[start:stop]
+def _part(batch: Batch, clips: slice, known: int) -> Batch:
+    """The first `known` latent frames of some clips."""
+    actions = batch.conditioning.modulation
+    assert actions is not None
+    embedded = Conditioning(actions[clips], None, Probe())
+    return Batch(batch.latents[clips, :known], embedded, batch.generators[clips])
 
 
 class TinyDenoiser(Denoiser):

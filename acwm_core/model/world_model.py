@@ -12,7 +12,7 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
-from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.model.stream import Stream, continued
 
@@ -112,7 +112,7 @@ class WorldModel(nn.Module):
         rows = self._prepare(actions, latents.shape[1])
         conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
         known = self.codec.latent_frames(self.context_frames)
-        return self.objective.loss(self.model, latents, conditioning, generators, known)
+        return self.objective.loss(self.model, Batch(latents, conditioning, generators), known)
 
     def rollout(
         self,
@@ -259,9 +259,8 @@ class WorldModel(nn.Module):
         rows = self._prepare(actions, length)
         conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
-            latents = self.objective.predict(
-                self.model, latents, conditioning, length, generators, steps
-            )
+            begin = Batch(latents, conditioning, generators)
+            latents = self.objective.predict(self.model, begin, length, steps)
         return self.codec.decode(latents, frames=frames)
 
     def checked(self, actions: Actions) -> Actions:

@@ -17,6 +17,7 @@ from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
@@ -255,9 +256,8 @@ class ModelRollouts:
         conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         given = given.expand(number, *[-1] * (given.ndim - 1))
-        return world.objective.predict(
-            world.model, given, conditioning, length, generators, self._steps
-        )
+        begin = Batch(given, conditioning, generators)
+        return world.objective.predict(world.model, begin, length, self._steps)
 
     def _known_frames(self, recent: Tensor) -> int:
         """Number of video frames from the first given one to the current one."""

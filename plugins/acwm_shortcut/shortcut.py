@@ -12,7 +12,7 @@ measured on the uniform grid from 0 (clean) to 1 (noise) that `shift` maps to no
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -23,7 +23,8 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
-from acwm_core.model.objectives.flow import MIN_SIGMA, drawn_noise, evaluation, mix, per_frame
+from acwm_core.model.objectives.flow import MIN_SIGMA, evaluation, mix, per_frame
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -67,23 +68,17 @@ class ShortcutForcing(DiffusionForcing):
         self.finest = finest
         self.bootstrapped = bootstrapped
 
-    def loss(
-        self,
-        model: Denoiser,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
         """Squared error of one evaluation with random noise levels and steps."""
+        latents, conditioning = batch.latents, batch.conditioning
         frames = latents.shape[1] - known
-        drawn = [self.draw_steps(frames, generator) for generator in generators]
+        drawn = [self.draw_steps(frames, generator) for generator in batch.generators]
         place, step = (
             functional.pad(torch.stack(each), (known, 0)).to(latents)
             for each in zip(*drawn, strict=True)
         )
         sigma = self.level(place)
-        noisy = mix(latents, drawn_noise(latents.shape[1:], generators).to(latents), sigma)
+        noisy = mix(latents, batch.noise(latents.shape[1]), sigma)
         target = latents.clone()
         long = step.any(1)
         if long.any():

@@ -13,6 +13,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Denoiser
 from acwm_core.model.objectives.full_sequence import FullSequence
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.objectives.regression import Regression
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
@@ -58,10 +59,10 @@ def test_any_conditioner_drives_any_model(model, conditioner):
         given, embedded = torch.randn(1, 1, 4, 8, 8), [embed(torch.rand(1, 9, 2)) for _ in range(2)]
         if not network.layers and embedded[0].modulation is None:
             with pytest.raises(RecipeError, match="set conditioner="):
-                objective.predict(network, given, embedded[0], 3, [])
+                objective.predict(network, Batch(given, embedded[0], []), 3)
             return
         one, other = (
-            objective.predict(network, given, each, 3, [torch.Generator().manual_seed(0)])
+            objective.predict(network, Batch(given, each, [torch.Generator().manual_seed(0)]), 3)
             for each in embedded
         )
     assert one.shape == (1, 3, 4, 8, 8)

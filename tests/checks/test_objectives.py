@@ -73,8 +73,8 @@ class SamplesForItself(Flawed):
 
 @FLAWS.caught_by("clips of a batch are independent", "clip by clip")
 class SumsClips(Flawed):
-    def loss(self, model, latents, *given):
-        return super().loss(model, latents, *given) * len(latents)
+    def loss(self, model, batch, known):
+        return super().loss(model, batch, known) * len(batch.latents)
 
 
 @FLAWS.caught_by("clips of a batch are independent", "with the rest of the batch")

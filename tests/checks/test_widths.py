@@ -7,6 +7,7 @@ from acwm_core.checks import check_conditioner, check_model
 from acwm_core.errors import RecipeError
 from acwm_core.model.build import build_conditioner, build_world_model
 from acwm_core.model.objectives.full_sequence import FullSequence
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, compose
 from acwm_dit.cross_attention import CrossAttention
@@ -52,13 +53,13 @@ def test_actions_reach_the_prediction_and_train_what_embeds_them(network, condit
     latents, actions = torch.randn(1, 3, 4, 8, 8), torch.rand(2, 9, 2)
     one, other = (
         objective.predict(
-            model, latents[:, :1], embed(rows[None]), 3, [torch.Generator().manual_seed(0)]
+            model, Batch(latents[:, :1], embed(rows[None]), [torch.Generator().manual_seed(0)]), 3
         )
         for rows in actions
     )
     assert not torch.allclose(one[:, 1:], other[:, 1:])
     draws = [torch.Generator().manual_seed(0)]
-    objective.loss(model, latents, embed(actions[:1]), draws, 1).backward()
+    objective.loss(model, Batch(latents, embed(actions[:1]), draws), 1).backward()
     idle = {name for name, parameter in embed.named_parameters() if not parameter.grad.any()}
     # Attention to a single action token does not depend on the query.
     assert {name for name in idle if "query" not in name and "norm_tokens" not in name} == set()

@@ -10,6 +10,7 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, Denoiser
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.next_frame import NextFrame, frames_before
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.recipe import ComponentConfig
 from acwm_dit.dit import DiT
 
@@ -94,13 +95,14 @@ def decaying(clips, frames=5):
 def test_the_loss_is_least_at_the_best_guess_from_the_noised_frame_before(noise):
     """E[z'·p] / E[p²] of p = (1 − σ) z + σ ε with σ uniform in [0, noise]."""
     model, objective, clips = Scaled(), next_frame(past_noise=noise), 3000
+    latents, actions = decaying(clips), conditioning(clips, 5)
     signal = 1 - noise / 2
     power = 1 - noise + 2 * noise**2 / 3
     best = DECAY * signal / power
     slopes = []
     for factor in (best, best - 0.1, best + 0.1):
         model.factor.data.fill_(factor)
-        loss = objective.loss(model, decaying(clips), conditioning(clips, 5), draws(clips), 1)
+        loss = objective.loss(model, Batch(latents, actions, draws(clips)), 1)
         slopes.append(torch.autograd.grad(loss, model.factor)[0].item())
     assert abs(slopes[0]) < 0.015
     assert slopes[1] < -0.1
@@ -111,7 +113,7 @@ def test_the_loss_is_least_at_the_best_guess_from_the_noised_frame_before(noise)
 def test_one_pass_over_a_clip_equals_sampling_it_frame_by_frame(known):
     model, given = dit(), normal(2, known, 4, 8, 8, seed=1)
     with torch.no_grad():
-        clip = next_frame().predict(model, given, conditioning(), 6, draws(2))
+        clip = next_frame().predict(model, Batch(given, conditioning(), draws(2)), 6)
         generators = draws(2)
         later = [
             torch.stack([torch.randn(4, 8, 8, generator=g) for g in generators])
@@ -138,7 +140,7 @@ def test_nothing_of_a_frame_itself_is_seen():
     changed[:, 3:] += 1
     with torch.no_grad():
         for clip in (latents, changed):
-            objective.loss(model, clip, conditioning(), draws(2), 1)
+            objective.loss(model, Batch(clip, conditioning(), draws(2)), 1)
     first, second = seen
     torch.testing.assert_close(first[:, :4], second[:, :4])
     assert (first[:, 4:] - second[:, 4:]).abs().mean() > 0.1
@@ -147,7 +149,7 @@ def test_nothing_of_a_frame_itself_is_seen():
 def test_own_past_shows_its_rollout_to_that_share_of_the_clips():
     model, clips = Scaled(0.5), 400
     latents, objective = decaying(clips), next_frame(past_noise=0.0, own_past=0.25)
-    objective.loss(model, latents, conditioning(clips, 5), draws(clips), 1)
+    objective.loss(model, Batch(latents, conditioning(clips, 5), draws(clips)), 1)
     (told,) = model.shown
     rollout = latents[:, :1] * 0.5 ** torch.arange(5)[:, None, None, None]
     own = (told - frames_before(rollout)).abs().amax((1, 2, 3, 4)) < 1e-5
@@ -158,8 +160,8 @@ def test_own_past_shows_its_rollout_to_that_share_of_the_clips():
 
 def test_a_clip_draws_the_same_beside_any_others():
     model, objective, latents = Scaled(), next_frame(own_past=0.5), decaying(3)
-    objective.loss(model, latents, conditioning(3, 5), draws(3), 1)
-    objective.loss(model, latents[1:], conditioning(2, 5), draws(2, seed=1), 1)
+    objective.loss(model, Batch(latents, conditioning(3, 5), draws(3)), 1)
+    objective.loss(model, Batch(latents[1:], conditioning(2, 5), draws(2, seed=1)), 1)
     both, alone = model.shown
     assert torch.equal(both[1:], alone)
 

@@ -13,6 +13,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.recipe import compose
 from acwm_dit.dit import DiT
 from acwm_shortcut.shortcut import ShortcutForcing
@@ -63,7 +64,7 @@ NOTHING = Conditioning(None, None, None)
 @pytest.mark.parametrize("steps", [1, 2, 4])
 def test_exact_steps_sample_the_distribution_in_any_number(shift, steps):
     objective, model, given = ShortcutForcing(shift=shift), Exact(shift), clean(3)[:, :1]
-    made = objective.predict(model, given, NOTHING, 4, draws(3), steps)
+    made = objective.predict(model, Batch(given, NOTHING, draws(3)), 4, steps)
     noise = torch.stack([torch.randn(4, 1, 2, 2, generator=g) for g in draws(3)])
     torch.testing.assert_close(made[:, 1:], (MEAN + SPREAD * noise)[:, 1:], atol=1e-3, rtol=0)
     assert len(model.steps) == steps
@@ -124,7 +125,7 @@ def trained(objective, steps=500):
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1, 0, steps)
     for step in range(steps):
         latents, generators = clean(16, frames=33, seed=step), draws(16, seed=16 * step)
-        loss = objective.loss(model, latents, NOTHING, generators, known=1)
+        loss = objective.loss(model, Batch(latents, NOTHING, generators), known=1)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -146,7 +147,7 @@ def test_after_training_one_step_samples_what_sixteen_of_the_flow_do():
     assert flow.std() > 0.75 * SPREAD
     for objective, steps, spread in ((plain, 1, 0.0), (shortcut, 1, flow.std().item())):
         model = trained(objective)
-        made = objective.predict(model, given, NOTHING, 5, draws(400), steps)[:, 1:]
+        made = objective.predict(model, Batch(given, NOTHING, draws(400)), 5, steps)[:, 1:]
         assert made.mean().item() == pytest.approx(MEAN, abs=0.06)
         assert made.std().item() == pytest.approx(spread, abs=0.03)
 

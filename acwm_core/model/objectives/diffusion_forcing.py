@@ -9,7 +9,8 @@ from torch.nn import functional
 
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, Denoiser, LatentStream
-from acwm_core.model.objectives.flow import FlowMatching, drawn_noise
+from acwm_core.model.objectives.flow import FlowMatching
+from acwm_core.model.objectives.objective import drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from acwm_core.errors import RecipeError, check_shape
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser
-from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.objective import Batch, Objective, drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
@@ -30,11 +30,6 @@ Space = Literal["velocity", "clean"]
 
 Evaluate = Callable[[Latent, Sigmas], Latent]
 """An evaluation of the network: maps noisy latents and noise levels to its prediction."""
-
-
-def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-    """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""
-    return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
 
 
 def shifted_schedule(points: int, shift: float) -> Tensor:
@@ -103,34 +98,21 @@ class FlowMatching(Objective[Denoiser]):
             else torch.ones_like(self._sigmas)
         )
 
-    def loss(
-        self,
-        model: Denoiser,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
         """The error of one evaluation at random noise levels; see `Objective.loss`."""
-        return self.error(evaluation(model, conditioning), latents, generators, known)
+        evaluate = evaluation(model, batch.conditioning)
+        return self.error(evaluate, batch.latents, batch.generators, known)
 
     def predict(
-        self,
-        model: Denoiser,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
+        self, model: Denoiser, given: Batch, frames: int, steps: int | None = None
     ) -> Latent:
         """Sample all frames together; see `Objective.predict`."""
-        noise = drawn_noise((frames, *given.shape[2:]), generators).to(given)
 
         def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
             inputs = self.sampling_inputs(sigma, steps)
-            return evaluation(model, conditioning, **inputs)(noisy, sigma)
+            return evaluation(model, given.conditioning, **inputs)(noisy, sigma)
 
-        return self.sample(evaluate, noise, given, steps)
+        return self.sample(evaluate, given.noise(frames), given.latents, steps)
 
     def sampling_inputs(self, sigma: Sigmas, steps: int | None) -> dict[str, Tensor]:
         """The further inputs of an evaluation in `steps` sampling steps, at levels `[B, L]`."""

@@ -18,13 +18,8 @@ from torch import Tensor
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, Denoiser, InputKind, LatentStream
-from acwm_core.model.objectives.flow import (
-    Evaluate,
-    FlowMatching,
-    drawn_noise,
-    evaluation,
-    mix,
-)
+from acwm_core.model.objectives.flow import Evaluate, FlowMatching, evaluation, mix
+from acwm_core.model.objectives.objective import Batch, drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -56,61 +51,44 @@ class NextFrame(FlowMatching):
         self.past_noise = past_noise
         self.own_past = own_past
 
-    def loss(
-        self,
-        model: Denoiser,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
         """The error of one evaluation after a past that is clean, noisy or the model's own."""
-        past = self._past(model, latents, conditioning, generators, known)
-        levels = torch.stack([torch.rand(latents.shape[1], generator=g) for g in generators])
-        noise = drawn_noise(latents.shape[1:], generators).to(latents)
+        latents, generators, frames = batch.latents, batch.generators, batch.latents.shape[1]
+        past = self._past(model, batch, known)
+        levels = torch.stack([torch.rand(frames, generator=each) for each in generators])
+        noise = batch.noise(frames)
         sigma = (levels * self.past_noise).to(latents)
         previous = mix(frames_before(past), noise, sigma)
-        after = evaluation(model, conditioning, previous=previous, previous_sigma=sigma)
+        after = evaluation(model, batch.conditioning, previous=previous, previous_sigma=sigma)
         return self.error(self.from_change(after, previous), latents, generators, known)
 
-    def _past(
-        self,
-        model: Denoiser,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Latent:
+    def _past(self, model: Denoiser, batch: Batch, known: int) -> Latent:
         """The clips, of which a share of `own_past` is the model's own rollout in one step."""
+        latents = batch.latents
         if not self.own_past:
             return latents
-        own = torch.stack([torch.rand((), generator=g) for g in generators]) < self.own_past
+        own = torch.stack([torch.rand((), generator=g) for g in batch.generators]) < self.own_past
         # Separate generators: whether there is a rollout depends on other clips of the batch.
-        seeds = [int(torch.randint(2**62, (), generator=g)) for g in generators]
+        seeds = [int(torch.randint(2**62, (), generator=g)) for g in batch.generators]
         if not own.any():
             return latents
         noises = [torch.Generator().manual_seed(seed) for seed in seeds]
-        given, frames = latents[:, :known], latents.shape[1]
+        given = Batch(latents[:, :known], batch.conditioning, noises)
         with torch.no_grad():
-            rollout = self.predict(model, given, conditioning, frames, noises, steps=1)
+            rollout = self.predict(model, given, latents.shape[1], steps=1)
         return torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
 
     def predict(
-        self,
-        model: Denoiser,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
+        self, model: Denoiser, given: Batch, frames: int, steps: int | None = None
     ) -> Latent:
         """Sample a clip frame by frame; see `Objective.predict`."""
-        known = given.shape[1]
-        stream = self.stream(model, given, generators, steps=steps, context=max(frames, 2))
-        clip = [given]
+        latents, known = given.latents, given.latents.shape[1]
+        context = max(frames, 2)
+        stream = self.stream(model, latents, given.generators, steps=steps, context=context)
+        clip = [latents]
         for frame in range(known, frames):
             start = 0 if frame == known else frame - 1
-            clip.append(stream.advance(conditioning.frames(start, frame + 1)))
+            clip.append(stream.advance(given.conditioning.frames(start, frame + 1)))
         return torch.cat(clip, 1)
 
     def stream(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import torch
@@ -15,6 +16,30 @@ from acwm_core.model.dynamics import Denoiser, DynamicsModel, InputKind, LatentS
 from acwm_core.model.shapes import Latent
 
 ModelT = TypeVar("ModelT", bound=DynamicsModel)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Clips of a batch: to learn from, or their beginning, to be continued.
+
+    Attributes:
+        latents: clean latent frames `[B, L, C, h, w]`; of a beginning, the given ones alone.
+        conditioning: the embedded actions of whole clips.
+        generators: one CPU generator per clip, the only source of randomness.
+    """
+
+    latents: Latent
+    conditioning: Conditioning
+    generators: Sequence[torch.Generator]
+
+    def noise(self, frames: int) -> Latent:
+        """Standard normal noise `[B, frames, C, h, w]`, of the latents' type and device."""
+        return drawn_noise((frames, *self.latents.shape[2:]), self.generators).to(self.latents)
+
+
+def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""
+    return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
 
 
 class Objective(ABC, Generic[ModelT]):
@@ -41,42 +66,23 @@ class Objective(ABC, Generic[ModelT]):
     steps: int | None = None
 
     @abstractmethod
-    def loss(
-        self,
-        model: ModelT,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: ModelT, batch: Batch, known: int) -> Tensor:
         """Training loss of a batch of clips, a scalar, over the frames after the given ones.
 
         Args:
             model: the model to train.
-            latents: clean latents `[B, L, C, h, w]`, L > `known`.
-            conditioning: the embedded actions of the clips.
-            generators: one CPU generator per clip.
+            batch: the clips, of L > `known` latent frames.
             known: number of latent frames that are given.
         """
 
     @abstractmethod
-    def predict(
-        self,
-        model: ModelT,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
-    ) -> Latent:
+    def predict(self, model: ModelT, given: Batch, frames: int, steps: int | None = None) -> Latent:
         """Predict a clip that starts with the given latent frames.
 
         Args:
             model: a trained model.
-            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
-            conditioning: the embedded actions of the clip.
-            frames: length L of the clip, including the given frames.
-            generators: one CPU generator per clip.
+            given: the first K ≥ 1 latent frames of clips.
+            frames: length L of the clips, including the given frames.
             steps: number of network evaluations, if there is a choice; `steps` of the objective by
                 default.
 

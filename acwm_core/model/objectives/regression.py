@@ -11,7 +11,7 @@ from torch.nn import functional
 from acwm_core.errors import check_shape
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
-from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Latent
 
 
@@ -23,29 +23,19 @@ class Regression(Objective[Predictor]):
 
     trains = Predictor
 
-    def loss(
-        self,
-        model: Predictor,
-        latents: Latent,
-        conditioning: Conditioning,
-        generators: Sequence[torch.Generator],
-        known: int,
-    ) -> Tensor:
+    def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
-        predicted = _predicted(model, latents[:, :known], conditioning, latents.shape[1])
-        return functional.mse_loss(predicted.float(), latents[:, known:].float())
+        given, true = batch.latents[:, :known], batch.latents[:, known:]
+        predicted = _predicted(model, given, batch.conditioning, batch.latents.shape[1])
+        return functional.mse_loss(predicted.float(), true.float())
 
     def predict(
-        self,
-        model: Predictor,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        generators: Sequence[torch.Generator],
-        steps: int | None = None,
+        self, model: Predictor, given: Batch, frames: int, steps: int | None = None
     ) -> Latent:
         """Predict the clip in one pass, without noise; see `Objective.predict`."""
-        return torch.cat([given, _predicted(model, given, conditioning, frames).to(given)], 1)
+        latents = given.latents
+        predicted = _predicted(model, latents, given.conditioning, frames)
+        return torch.cat([latents, predicted.to(latents)], 1)
 
     def stream(
         self,
