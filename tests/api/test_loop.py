@@ -10,8 +10,8 @@ import torch
 
 import acwm
 from acwm_core.data.card import DatasetCard
-from tests.core.tiny import tiny_world_model
-from tests.evaluation import tiny
+from tests import tiny
+from tests.tiny import pointwise_world_model
 
 PAGE = Path(__file__).parents[2] / "docs" / "python.md"
 
@@ -47,7 +47,7 @@ def test_a_world_model_is_built_from_either_card(run):
 
 
 def test_the_noise_of_a_loss_follows_torchs_seed():
-    world_model = tiny_world_model()
+    world_model = pointwise_world_model()
     latents, actions = torch.randn(3, 4, 3, 2, 2), torch.zeros(3, 13, 2)
 
     def loss(seed):

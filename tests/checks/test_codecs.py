@@ -12,7 +12,7 @@ from acwm_core.checks.codec import CodecChecks
 from acwm_core.checks.result import checks_of
 from tests.checks.results import Flaws, failures, in_words, installed
 from tests.codecs.tiny_autoencoders import save_tiny_codecs
-from tests.core.tiny import MeanCodec
+from tests.tiny import MeanCodec
 
 FLAWS = Flaws(check_codec, checks_of(CodecChecks))
 FLAWS[MeanCodec] = "no frame is lost", "leaves no trace"

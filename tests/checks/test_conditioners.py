@@ -18,7 +18,7 @@ from acwm_core.model.objectives.regression import Regression
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed
 from tests.checks.toys import AtTheInput, OneWidth
-from tests.core.tiny import SumConditioner
+from tests.tiny import SumConditioner
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
 FLAWS = Flaws(check_conditioner, checks_of(ConditionerChecks))

@@ -18,7 +18,7 @@ from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
 from tests.checks.toys import SmallUNet
-from tests.core.tiny import PointwiseModel
+from tests.tiny import PointwiseModel
 
 SMALL = {"width": 32, "layers": 2, "heads": 2}
 FLAWS = Flaws(check_model, (*checks_of(DynamicsChecks), *checks_of(DenoiserChecks)))

@@ -6,8 +6,8 @@ from torch.nn import functional
 
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Denoiser
-from tests.core.tiny import SumConditioner
 from tests.plugins import plugin_of
+from tests.tiny import SumConditioner
 
 
 class SmallUNet(Denoiser):

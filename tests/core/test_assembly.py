@@ -7,7 +7,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.build import build_world_model
 from acwm_core.plugins import catalog, hookimpl
 from acwm_core.recipe import compose
-from tests.core.tiny import PointwiseModel
+from tests.tiny import PointwiseModel
 
 CARD = EnvironmentCard(
     name="square",

@@ -11,7 +11,7 @@ from acwm_core.model.dynamics import Cache
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
-from tests.core.tiny import MeanCodec, PointwiseModel, SumConditioner
+from tests.tiny import MeanCodec, PointwiseModel, SumConditioner
 
 
 class FrameCodec(MeanCodec):

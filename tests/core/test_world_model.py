@@ -7,7 +7,7 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
-from tests.core.tiny import MeanCodec, tiny_world_model
+from tests.tiny import MeanCodec, pointwise_world_model
 
 
 def first_frame(batch=2):
@@ -22,7 +22,7 @@ def actions(batch=2, frames=37, size=2):
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 5, 37, 40, 66, 80])
 def test_rollout_gives_a_frame_per_action_row_and_starts_with_the_given_one(frames):
-    world = tiny_world_model()
+    world = pointwise_world_model()
     video = world.rollout(first_frame(), actions(frames=frames))
     assert video.shape == (2, frames, 3, 16, 16)
     expected = world.codec(first_frame()[:, None])[:, 0]
@@ -32,7 +32,7 @@ def test_rollout_gives_a_frame_per_action_row_and_starts_with_the_given_one(fram
 
 
 def test_a_clip_does_not_depend_on_its_neighbours_in_the_batch():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     together = world.rollout(first_frame(), actions(), seeds=[7, 8])
     alone = world.rollout(first_frame()[1:], actions()[1:], seeds=[8])
     torch.testing.assert_close(together[1:], alone)
@@ -41,7 +41,7 @@ def test_a_clip_does_not_depend_on_its_neighbours_in_the_batch():
 
 
 def test_long_rollouts_chain_windows_from_the_last_predicted_frame():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     long = world.rollout(first_frame(1), actions(1, 9), window=5, seeds=[3])
     generator = torch.Generator().manual_seed(3)
     head = world._predict(first_frame(1)[:, None], actions(1, 9)[:, :5], None, [generator])
@@ -51,7 +51,7 @@ def test_long_rollouts_chain_windows_from_the_last_predicted_frame():
 
 def test_windows_after_several_given_frames_begin_with_the_last_ones_predicted():
     """Five frames are given, two latent ones; a window of 13 predicts 8, the next begins with 5."""
-    world = tiny_world_model()
+    world = pointwise_world_model()
     given, rows = torch.rand(1, 5, 3, 16, 16), actions(1, 20)
     long = world.rollout(given, rows, window=13, seeds=[3])
     assert long.shape[1] == 20
@@ -63,13 +63,13 @@ def test_windows_after_several_given_frames_begin_with_the_last_ones_predicted()
 
 
 def test_a_single_frame_may_have_an_axis_of_time():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     one, other = (world.rollout(f, actions()) for f in (first_frame(), first_frame()[:, None]))
     assert torch.equal(one, other)
 
 
 def test_a_model_learns_what_follows_the_frames_that_it_is_given():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     components = world.codec, world.model, world.conditioner, world.objective
     parts = *components, [-2.0, -2.0], [2.0, 2.0]
     world = WorldModel(*parts, clip_frames=13, context_frames=5)
@@ -89,7 +89,7 @@ def test_a_model_learns_what_follows_the_frames_that_it_is_given():
 
 @pytest.mark.parametrize(("clip_frames", "context_frames"), [(13, 2), (13, 4), (13, 13), (13, 0)])
 def test_given_frames_must_make_whole_latent_frames_and_leave_some(clip_frames, context_frames):
-    world = tiny_world_model()
+    world = pointwise_world_model()
     components = world.codec, world.model, world.conditioner, world.objective
     parts = *components, [-2.0, -2.0], [2.0, 2.0]
     with pytest.raises(RecipeError, match=rf"data\.context_frames={context_frames} must be 1 plus"):
@@ -97,7 +97,7 @@ def test_given_frames_must_make_whole_latent_frames_and_leave_some(clip_frames, 
 
 
 def test_actions_are_normalised_by_the_bounds_and_the_last_goes_on_to_a_row_of_raw_zeros():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     world.action_low.copy_(torch.tensor([0.0, -2.0]))
     raw = torch.tensor([[[0.0, -2.0], [2.0, 2.0], [1.0, 1.0]]])
     prepared = world._prepare(raw, latent_frames=2)
@@ -108,7 +108,7 @@ def test_actions_are_normalised_by_the_bounds_and_the_last_goes_on_to_a_row_of_r
 
 def test_a_video_that_ends_within_a_latent_frame_is_that_of_actions_that_go_on():
     """5 frames are two latent frames, of which 4 are predicted from the actions that lead there."""
-    world = tiny_world_model()
+    world = pointwise_world_model()
     rows = actions(1, 5)
     rows[:, 3] = rows[:, 2]
     whole = world.rollout(first_frame(1), rows, seeds=[3])
@@ -117,7 +117,7 @@ def test_a_video_that_ends_within_a_latent_frame_is_that_of_actions_that_go_on()
 
 
 def test_loss_reaches_model_and_conditioner_but_not_the_codec():
-    world = tiny_world_model().train()
+    world = pointwise_world_model().train()
     assert not world.codec.training
     video = torch.rand(2, 9, 3, 16, 16, generator=torch.Generator().manual_seed(0))
     world.loss(world.encode(video), actions(frames=9), [torch.Generator()] * 2).backward()
@@ -130,7 +130,7 @@ def test_loss_reaches_model_and_conditioner_but_not_the_codec():
 def test_a_short_training_learns_what_actions_do(objective):
     """Blocks brighten with the summed action; after training, true actions beat swapped ones."""
     settings = {"prediction": "clean", "loss_on": "clean", "weighting": "none", "shift": 20}
-    world = tiny_world_model(objective=objective, **settings)
+    world = pointwise_world_model(objective=objective, **settings)
     optimizer = torch.optim.Adam(world.parameters(), 1e-2)
     generator = torch.Generator().manual_seed(0)
 
@@ -153,7 +153,7 @@ def test_a_short_training_learns_what_actions_do(objective):
 
 
 def test_wrong_shapes_are_refused_with_a_sentence():
-    world = tiny_world_model()
+    world = pointwise_world_model()
     with pytest.raises(ShapeError, match="2 action dimensions, not 3"):
         world.rollout(first_frame(), actions(size=3))
     with pytest.raises(ShapeError, match="1 first frames for 2"):
@@ -184,11 +184,11 @@ WRONG_ACTIONS = [
 @pytest.mark.parametrize(("spoil", "error", "sentence"), WRONG_ACTIONS)
 def test_actions_that_no_model_was_built_for_are_refused(spoil, error, sentence):
     with pytest.raises(error, match=sentence):
-        tiny_world_model().rollout(first_frame(), spoil(actions()))
+        pointwise_world_model().rollout(first_frame(), spoil(actions()))
 
 
 def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
-    world, rows = tiny_world_model(), actions()
+    world, rows = pointwise_world_model(), actions()
     rows[:, 0], rows[:, 1] = 2 + 1e-6, -2
     usual = torch.cat([*world.rollout_chunks(first_frame(), rows)], 1)
     assert torch.equal(world.rollout(first_frame(), rows), usual)
@@ -211,7 +211,7 @@ def test_actions_at_their_bounds_and_the_last_row_are_taken_as_they_are():
 def test_frames_that_are_no_pictures_are_refused(way, spoil, sentence):
     given = {"rollout": (actions(),), "stream": ()}[way]
     with pytest.raises(ShapeError, match=sentence):
-        getattr(tiny_world_model(), way)(spoil(first_frame()), *given)
+        getattr(pointwise_world_model(), way)(spoil(first_frame()), *given)
 
 
 def test_a_codec_refuses_more_frames_than_its_latents_hold():

@@ -2,13 +2,13 @@ import pytest
 import torch
 
 from acwm_core.data.generate import generate
-from tests.policies import slide
+from tests import tiny
 
 
 @pytest.fixture(scope="session", autouse=True)
 def parts():
     torch.set_num_threads(1)
-    slide.register()
+    tiny.register()
 
 
 @pytest.fixture(scope="session")
@@ -22,4 +22,4 @@ def data(parts, tmp_path_factory):
 @pytest.fixture(scope="session")
 def run(data, tmp_path_factory):
     """A run whose model knows its world; tests must not change it."""
-    return slide.make_run(tmp_path_factory.mktemp("dream") / "run", path=str(data))
+    return tiny.make_exact_run(tmp_path_factory.mktemp("dream") / "run", path=str(data))

@@ -1,8 +1,7 @@
 """A run of the recurrent model without training: it has a state that it carries on."""
 
 from acwm_core.plugins import catalog
-from tests.evaluation import tiny as evaluation
-from tests.planning import tiny
+from tests import tiny
 
 
 def make_run(folder, data):
@@ -15,4 +14,4 @@ def make_run(folder, data):
         "conditioner": {"name": "adaln"},
         "data": {"path": str(data), "clip_frames": 13},
     }
-    return evaluation.make_run(folder, data, parts=parts)
+    return tiny.make_run(folder, data, parts=parts)

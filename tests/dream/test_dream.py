@@ -14,8 +14,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
 from acwm_dream.environment import Dream
-from tests.planning import tiny
-from tests.policies import slide
+from tests import tiny
 
 acwm.register()
 
@@ -40,8 +39,8 @@ def test_gymnasium_s_checks_pass(run, task):
 
 def test_it_is_the_world_that_it_dreams_of(run):
     """Frame by frame and reward by reward, an action held for a latent frame in both."""
-    env, true = dream(run), tiny.environment()
-    assert env.unwrapped.repeat == slide.STRIDE
+    env, true = dream(run), tiny.task_environment()
+    assert env.unwrapped.repeat == tiny.STRIDE
     for seed in range(4):
         spec = tiny.spec(seed)
         frame, info = env.reset(seed=seed, options={"spec": spec})
@@ -51,12 +50,12 @@ def test_it_is_the_world_that_it_dreams_of(run):
         for action in actions(3, seed):
             frame, reward, over, late, info = env.step(action)
             wanted = 0.0
-            for _ in range(slide.STRIDE):
+            for _ in range(tiny.STRIDE):
                 _, part, solved, _, told = true.step(action)
                 wanted += part
                 if solved:
                     break
-            assert reward == pytest.approx(wanted, abs=1.5 * slide.STRIDE)
+            assert reward == pytest.approx(wanted, abs=1.5 * tiny.STRIDE)
             away = np.abs(info["state"]["position"] - told["state"]["position"]).max()
             assert away <= 1.5 or solved
             if over or solved:
@@ -70,7 +69,7 @@ def test_success_ends_an_episode_and_time_cuts_it_off(run):
     _, info = env.reset(options={"spec": tiny.spec(0)})
     goal = info["goal"].state["position"]
     for _ in range(25):
-        action = np.clip((goal - info["state"]["position"]) / slide.STRIDE, -2, 2)
+        action = np.clip((goal - info["state"]["position"]) / tiny.STRIDE, -2, 2)
         _, _, over, late, info = env.step(action.astype(np.float32))
         if over:
             break
@@ -84,7 +83,7 @@ def test_success_ends_an_episode_and_time_cuts_it_off(run):
 
 def test_failures_last_and_are_no_success(run):
     env = dream(run, "shy")  # the left half is forbidden
-    left = slide.squares(torch.tensor([[10.0, 6.0]]))[0].permute(1, 2, 0).mul(255).byte().numpy()
+    left = tiny.squares(torch.tensor([[10.0, 6.0]]))[0].permute(1, 2, 0).mul(255).byte().numpy()
     goal = Goal({"position": np.array([10.0, 14.0])}, left[..., 0], left)
     _, info = env.reset(options={"frame": left, "goal": goal})
     assert (info["failed"], info["distance"]) == (True, 8)
@@ -116,7 +115,7 @@ def test_starts_of_a_dataset_need_no_simulator(run, data, monkeypatch):
 def test_a_picture_is_a_start_and_another_a_goal(run):
     env = dream(run)
     here, there = (
-        slide.squares(torch.tensor([[row, 8.0]]))[0].permute(1, 2, 0).mul(255).byte().numpy()
+        tiny.squares(torch.tensor([[row, 8.0]]))[0].permute(1, 2, 0).mul(255).byte().numpy()
         for row in (3.0, 15.0)
     )
     frame, info = env.reset(options={"frame": here, "goal": there})
@@ -131,14 +130,14 @@ def test_a_picture_is_a_start_and_another_a_goal(run):
 
 
 def test_a_model_that_is_given_more_frames_is_given_them(tmp_path, data):
-    run = slide.make_run(tmp_path / "run", path=str(data), context_frames=5)
+    run = tiny.make_exact_run(tmp_path / "run", path=str(data), context_frames=5)
     episode = EpisodeDataset(data, "train")[1]
     env = dream(run, start="dataset")
     frame, _ = env.reset(options={"episode": 1})
     assert np.abs(frame.astype(int) - episode.video[4]).max() <= 1
     still = dream(run)
     frame, _ = still.reset(options={"spec": tiny.spec(3)})
-    true, _ = tiny.environment().reset(options={"spec": tiny.spec(3)})
+    true, _ = tiny.task_environment().reset(options={"spec": tiny.spec(3)})
     assert np.abs(frame.astype(int) - true).max() <= 1
 
 
@@ -210,7 +209,7 @@ def test_actions_are_checked(run):
 
 
 def test_a_world_without_an_estimator_has_no_tasks_in_a_dream(tmp_path):
-    run = slide.make_run(tmp_path / "run", environment="unread")
+    run = tiny.make_exact_run(tmp_path / "run", environment="unread")
     with pytest.raises(AcwmError, match="no estimator reads the states of unread"):
         dream(run)
     env = dream(run, None)
@@ -220,7 +219,7 @@ def test_a_world_without_an_estimator_has_no_tasks_in_a_dream(tmp_path):
 
 
 def test_a_model_that_cannot_be_streamed_is_refused(tmp_path):
-    run = tiny.make_run(tmp_path)
+    run = tiny.make_slide_run(tmp_path)
     with pytest.raises(
         RecipeError, match="cannot be used as an environment: a model trained with FullSequence"
     ):

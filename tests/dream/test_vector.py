@@ -6,8 +6,7 @@ import pytest
 
 import acwm
 from acwm_core.errors import AcwmError, ShapeError
-from tests.planning import tiny
-from tests.policies import slide
+from tests import tiny
 
 acwm.register()
 
@@ -20,7 +19,7 @@ def dreams(run, number=3, **settings):
 
 def towards(info, goals):
     """Straight to the goals, as far as a step reaches."""
-    away = (goals - info["state"]["position"]) / slide.STRIDE
+    away = (goals - info["state"]["position"]) / tiny.STRIDE
     return np.clip(away, -2, 2).astype(np.float32)
 
 

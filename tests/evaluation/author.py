@@ -7,7 +7,7 @@ import numpy as np
 from acwm_core.env.environment import Environment
 from acwm_core.evaluation.metric import Metric
 from acwm_core.plugins import hookimpl
-from tests.evaluation.tiny import Drift, LinearModel
+from tests.tiny import Drift, PointwiseModel
 
 
 def name_of(target):
@@ -82,9 +82,9 @@ class DriftMetric(Metric):
         return (prediction.video - prediction.target).abs().mean((1, 2, 3)).double().numpy()
 
 
-class RaisingModel(LinearModel):
+class RaisingModel(PointwiseModel):
     def forward(self, latents, sigma, conditioning):
-        return latents @ self.enter.weight  # line of RaisingModel
+        return latents @ self.enter.weight.T  # line of RaisingModel
 
 
 TARGETS = {

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.evaluation import tiny
+from tests import tiny
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -12,7 +12,8 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import notes
 from acwm_core.plugins import catalog
-from tests.evaluation import author, tiny
+from tests import tiny
+from tests.evaluation import author
 
 HERE = Path(author.__file__)
 ROOT = Path(__file__).parents[2]

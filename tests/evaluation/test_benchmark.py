@@ -14,7 +14,7 @@ from acwm_core.evaluation.protocol import Protocol, protocol_named
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import Catalog, hookimpl
-from tests.evaluation import tiny
+from tests import tiny
 
 
 class Ends(Protocol):

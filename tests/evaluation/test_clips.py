@@ -15,7 +15,7 @@ from acwm_core.evaluation.clips import (
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.predict import Evaluator
-from tests.core.tiny import tiny_world_model
+from tests.tiny import pointwise_world_model
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 17, 100])
@@ -78,14 +78,14 @@ def test_batches_hold_clips_of_one_length(data):
     episodes = EpisodeDataset(data, "ind_test")
     lengths = [9, 9, 9, 5, 9]
     clips = [Clip("ind_test", e, 0, n) for e, n in enumerate(lengths)]
-    evaluator = Evaluator(tiny_world_model(), None, {}, EvaluationConfig(batch_size=2))
+    evaluator = Evaluator(pointwise_world_model(), None, {}, EvaluationConfig(batch_size=2))
     made = evaluator.predictions(clips, episodes, ["copy"])
     grouped = [[len(each.video) for each in batch] for batch in made]
     assert grouped == [[9, 9], [9], [5], [9]]
 
 
 def test_rows_predict_what_they_are_named_after():
-    world_model = tiny_world_model().eval()
+    world_model = pointwise_world_model().eval()
     generator = torch.Generator().manual_seed(0)
     video = torch.rand(2, 9, 3, 16, 16, generator=generator)
     own, other = torch.rand(2, 2, 9, 2, generator=generator)

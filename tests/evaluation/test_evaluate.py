@@ -19,7 +19,7 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
-from tests.evaluation import tiny
+from tests import tiny
 
 
 def by_hand(run, data, split):

@@ -19,7 +19,7 @@ from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from acwm_metrics.response import Response
-from tests.evaluation import tiny
+from tests import tiny
 from tests.evaluation.test_counterfactual import Episodes, Known, response, simulator
 
 GIVEN = 5

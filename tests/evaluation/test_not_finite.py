@@ -21,7 +21,7 @@ from acwm_core.training.run import RunFolder, load_run
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import boards_of
 from acwm_report.page import write_report
-from tests.evaluation import tiny
+from tests import tiny
 
 
 def copied(run, to):

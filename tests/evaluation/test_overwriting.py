@@ -16,7 +16,7 @@ from acwm_core.files import held
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
 from acwm_severity.sweep import sweep_severity
-from tests.evaluation import tiny
+from tests import tiny
 
 FAST = {"counterfactual_episodes": 0, "perturbed_episodes": 0, "videos": 0}
 

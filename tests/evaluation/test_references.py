@@ -14,7 +14,7 @@ from acwm_core.evaluation.evaluate import evaluate_run, open_run
 from acwm_core.evaluation.references import KEPT, package_hash, references_file
 from acwm_core.evaluation.results import Summary
 from acwm_core.training.run import RunFolder
-from tests.evaluation import tiny
+from tests import tiny
 
 
 @pytest.fixture

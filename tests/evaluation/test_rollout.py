@@ -13,7 +13,7 @@ from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import _read_actions, frame_strip, rollout_run
 from acwm_formats.arrays import write_dataset
-from tests.evaluation import tiny
+from tests import tiny
 from tests.recordings import Noise
 
 DIVIDER, SCALE, SIDE = 2, 8, 32

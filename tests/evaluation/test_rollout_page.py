@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from tests.evaluation import tiny
+from tests import tiny
 
 PAGE = Path(__file__).parents[2] / "docs" / "rollout.md"
 

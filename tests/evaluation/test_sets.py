@@ -11,7 +11,7 @@ from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import catalog, hookimpl
 from acwm_severity.curves import read_severity
 from acwm_severity.sweep import sweep_severity
-from tests.evaluation import tiny
+from tests import tiny
 
 SSIM = "torchmetrics.image.StructuralSimilarityIndexMeasure"
 

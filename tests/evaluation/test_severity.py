@@ -17,7 +17,7 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.executors import LocalExecutor
 from acwm_severity.curves import POINTS, parse_sweep, read_severity
 from acwm_severity.sweep import sweep_severity
-from tests.evaluation import tiny
+from tests import tiny
 
 COUNT = Factor.discrete("count", "how many", train=(1, 2, 3), ood=(4, 5), nominal=2)
 GRAINS = Factor.discrete("grains", "how many grains", train=(3000,), ood=(6000,), nominal=3000)
@@ -240,7 +240,7 @@ def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
 
 def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
     run, _ = swept
-    monkeypatch.setattr(tiny, "SIDE", 20)
+    monkeypatch.setattr(tiny.Drift, "side", 20)
     with pytest.raises(DataError, match="does not reproduce the videos of the data"):
         sweep(run)
 

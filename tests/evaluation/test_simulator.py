@@ -19,7 +19,7 @@ from acwm_core.evaluation.interventions import (
 )
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.score import build_metrics
-from tests.evaluation import tiny
+from tests import tiny
 from tests.evaluation.test_counterfactual import Episodes
 
 
@@ -112,7 +112,7 @@ def test_recorded_data_has_no_simulator_to_ask(data):
 
 def test_simulators_that_are_missing_or_changed_are_not_asked(data, monkeypatch):
     simulator_of(EpisodeDataset(data, "ind_test")).close()
-    monkeypatch.setattr(tiny, "SIDE", 20)
+    monkeypatch.setattr(tiny.Drift, "side", 20)
     with pytest.raises(DataError, match="does not reproduce the videos of the data"):
         simulator_of(EpisodeDataset(data, "ind_test"))
     episodes = EpisodeDataset(data, "ind_test")

@@ -15,7 +15,7 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from acwm_report.page import write_report
-from tests.evaluation import tiny
+from tests import tiny
 
 HEADING = "How many sampling steps it takes"
 

@@ -9,7 +9,7 @@ from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import rollout_run
-from tests.evaluation import tiny
+from tests import tiny
 
 RECIPE = {
     "env": {"name": "drift"},

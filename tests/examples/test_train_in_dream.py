@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import acwm
-from tests.policies import slide
+from tests import tiny
 
 PATH = Path(__file__).parents[2] / "examples" / "train_in_dream.py"
 
@@ -23,9 +23,9 @@ def example():
 
 
 def make_run(folder, model):
-    slide.register()
+    tiny.register()
     acwm.register()
-    return slide.make_run(folder / model, model)
+    return tiny.make_exact_run(folder / model, model)
 
 
 def test_a_few_steps_of_it(example, tmp_path, capsys):

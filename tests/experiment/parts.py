@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from acwm_core.env.task import Goal, Task
-from tests.evaluation import tiny
+from tests import tiny
 from tests.plugins import plugin_of
 
 HOLD = "hold"
@@ -29,8 +29,8 @@ def noted(handler):
     return receive
 
 
-class WaitingModel(tiny.LinearModel):
-    """Like `LinearModel`; `fails` lets training end in an error."""
+class WaitingModel(tiny.PointwiseModel):
+    """Like `PointwiseModel`; `fails` lets training end in an error."""
 
     def __init__(self, *, latent_channels: int, width: int = 4, fails: bool = False):
         super().__init__(latent_channels=latent_channels, width=width)
@@ -65,9 +65,9 @@ CORNER = Corner()
 
 Plugin = plugin_of(
     environments={"square": "tests.data.square_world:Square"},  # whose workers need no torch
-    codecs={"blocks": "tests.evaluation.tiny:BlockCodec"},
+    codecs={"blocks": "tests.tiny:BlockCodec"},
     models={"waiting": f"{__name__}:WaitingModel"},
-    conditioners={"linear": "tests.core.tiny:SumConditioner"},
+    conditioners={"linear": "tests.tiny:SumConditioner"},
     tasks={"square.corner": f"{__name__}:CORNER"},
 )
 

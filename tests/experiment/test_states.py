@@ -24,7 +24,7 @@ from acwm_experiment.steps import (
 )
 from acwm_experiment.table import Experiment
 from acwm_report.experiment import evaluated_runs
-from tests.evaluation import tiny
+from tests import tiny
 
 TABLE = """
 rows: {one: mine, two: mine model.width=6}

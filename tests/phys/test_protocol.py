@@ -27,7 +27,7 @@ from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run import load_run
 from acwm_phys.protocol import PublishedWindows
 from acwm_report.commands import evaluate
-from tests.evaluation import tiny
+from tests import tiny
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 PROTOCOL = PublishedWindows()

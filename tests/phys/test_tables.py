@@ -13,7 +13,7 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
 from acwm_report.commands import evaluate
 from acwm_report.terminal import about_published, print_summary
-from tests.evaluation import tiny
+from tests import tiny
 
 TABLES = published_tables()
 ROWS = [row for table in TABLES.values() for row in table.rows]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.planning import tiny
+from tests import tiny
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -13,4 +13,4 @@ def parts():
 @pytest.fixture(scope="session")
 def run(parts, tmp_path_factory):
     """Tests must not change it."""
-    return tiny.make_run(tmp_path_factory.mktemp("planning"))
+    return tiny.make_slide_run(tmp_path_factory.mktemp("planning"))

@@ -14,7 +14,7 @@ from acwm_core.errors import AcwmError, RecipeError
 from acwm_core.plugins import catalog
 from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
 from acwm_planning.planner import Cost, Futures
-from tests.planning import tiny
+from tests import tiny
 from tests.planning.problems import planned, quadratic
 
 

@@ -11,7 +11,7 @@ from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.planner import Driver
 from acwm_planning.run import make_cost, make_planner
 from acwm_planning.settings import settings_of
-from tests.planning import tiny
+from tests import tiny
 
 FEW = (
     *("planner.candidates=16", "planner.elites=4", "planner.iterations=2", "planner.horizon=1"),
@@ -36,7 +36,7 @@ def driver(bundle):
 
 @pytest.fixture
 def history():
-    made = tiny.environment()
+    made = tiny.task_environment()
     frame, info = made.reset(options={"spec": tiny.spec(0)})
     found = History(tiny.spec(0), [frame])
     for _ in range(9):

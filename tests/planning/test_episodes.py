@@ -21,7 +21,7 @@ from acwm_planning.episode import TaskVariant, play
 from acwm_planning.futures import History
 from acwm_planning.sampling import CrossEntropy, ImprovedCrossEntropy
 from acwm_planning.simulator import SimulatorFutures, SimulatorRollouts
-from tests.planning import tiny
+from tests import tiny
 
 SMALL = {"candidates": 24, "iterations": 3, "elites": 4, "horizon": 4, "action_block": 2}
 
@@ -34,7 +34,7 @@ def planner(kind=ImprovedCrossEntropy, seed=0, task=tiny.PLACE, **params):
 
 
 def played(controller, seed, task=tiny.PLACE):
-    return play(tiny.environment(task), tiny.spec(seed), controller)
+    return play(tiny.task_environment(task), tiny.spec(seed), controller)
 
 
 def test_planning_in_the_simulator_gets_there_and_doing_nothing_does_not():
@@ -180,7 +180,7 @@ def test_scripts_and_chance_act_as_they_say():
 
 def test_goals_ahead_are_made_by_the_behaviour():
     ahead = TaskVariant(tiny.PLACE, steps=6, max_steps=20)
-    stage = tiny.environment(ahead)
+    stage = tiny.task_environment(ahead)
     stage.reset(options={"spec": tiny.spec(0)})
     goal = stage.goal.state["position"]
     start = stage.environment._position
@@ -192,7 +192,7 @@ def test_goals_ahead_are_made_by_the_behaviour():
     found = play(stage, tiny.spec(0), planner())
     assert found.success
     late = play(
-        tiny.environment(TaskVariant(tiny.PLACE, steps=None, max_steps=3)),
+        tiny.task_environment(TaskVariant(tiny.PLACE, steps=None, max_steps=3)),
         tiny.spec(0),
         StillController(),
     )

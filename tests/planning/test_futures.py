@@ -9,7 +9,7 @@ import torch
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.training.run import load_run
 from acwm_planning.futures import GoalCost, History, ModelRollouts
-from tests.planning import tiny
+from tests import tiny
 
 STILL = np.zeros(2, np.float32)
 
@@ -121,7 +121,7 @@ def test_the_gradient_of_a_sampled_future_is_its_slope(tmp_path, history, object
     model = {"name": "dit_xs", "width": 16, "layers": 2}
     objective = {"name": objective, "prediction": "clean", "steps": 3}
     parts = {"model": model, "conditioner": {"name": "adaln"}, "objective": objective}
-    bundle = load_run(tiny.make_run(tmp_path, parts=parts))
+    bundle = load_run(tiny.make_slide_run(tmp_path, parts=parts))
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
 
     def judge(futures, task, goal):

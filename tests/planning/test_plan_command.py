@@ -12,7 +12,7 @@ import pytest
 from acwm_core.cli import main
 from acwm_planning.page import write_page
 from acwm_planning.settings import ROW_NAMES, settings_of
-from tests.planning import tiny
+from tests import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
 
@@ -123,7 +123,7 @@ def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
 def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):
     recurrent = {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1}
     parts = {"model": recurrent, "conditioner": {"name": "adaln", "embedding": "stacked"}}
-    mine = tiny.make_run(tmp_path, parts=parts)
+    mine = tiny.make_slide_run(tmp_path, parts=parts)
     words = ["plan", mine, "place", "planner=gradient", "planner.iterations=2", "--videos", "0"]
     code, out, err = acwm(capsys, *words, "--compare")
     assert code == 0, err

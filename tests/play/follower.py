@@ -4,18 +4,17 @@ It predicts push_cube: the first frame stays, and each frame shows the disc at t
 action before it asked the pusher to go to.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import nn
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import resolve_size
-from acwm_core.model.build import build_world_model
-from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
-from acwm_core.training.run import save_weights
-from tests.evaluation.tiny import METRICS
+from tests import tiny
 from tests.plugins import plugin_of
 
 SIDE, STRIDE = 64, 4
@@ -57,20 +56,6 @@ class _FollowerStream(LatentStream):
         return nn.functional.pixel_unshuffle(frames.flatten(1, 2), 8)[:, None]
 
 
-class Raw(Conditioner):
-    """The normalised actions of a latent frame in a row."""
-
-    history = 1
-
-    def __init__(self, *, action_size, temporal_stride, width, layers, heads):
-        super().__init__()
-
-    def forward(self, actions):
-        first = actions.new_zeros(len(actions), 1, 2 * STRIDE)
-        rows = actions[:, :-1].unflatten(1, (-1, STRIDE)).flatten(2)
-        return Conditioning(torch.cat([first, rows], 1), None, self)
-
-
 def disturb(world):
     """Give a fresh model weights that make it change what it sees, and heed actions."""
     torch.manual_seed(0)
@@ -81,12 +66,9 @@ def disturb(world):
 
 
 def register():
+    tiny.register()
     if "follower" not in catalog().plugins:
-        where = "tests.play.follower"
-        plugin = plugin_of(
-            models={"follower": f"{where}:Follower"}, conditioners={"raw": f"{where}:Raw"}
-        )
-        catalog().add_plugin(plugin, "follower")
+        catalog().add_plugin(plugin_of(models={"follower": f"{__name__}:Follower"}), "follower")
 
 
 def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
@@ -94,7 +76,6 @@ def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
     register()
     card = catalog().component("environment", environment).load().card
     size = resolve_size(SIDE, card.frame_size)
-    card = type(card)(**{**card.__dict__, "frame_size": size})
     recipe = Recipe.from_dict(
         {
             "env": {"name": environment},
@@ -103,15 +84,9 @@ def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
             "conditioner": {"name": conditioner},
             **({} if model else {"objective": {"name": "regression"}}),
             "data": {"path": "data/none", "clip_frames": 9},
-            "evaluation": METRICS,
+            "evaluation": tiny.METRICS,
         }
     )
-    folder.mkdir(parents=True)
-    (folder / "recipe.yaml").write_text(recipe.to_yaml())
-    DatasetCard(card, {"train": 1}, 0, {"size": list(size)}, {}, 1, {}).write(folder)
-    world = build_world_model(recipe, card)
-    if model:
-        disturb(world)
-    weights = world.state_dict()
-    save_weights(folder / "model.safetensors", weights, world.codec.fingerprint(), step=1)
-    return folder
+    card = replace(card, frame_size=size)
+    data = DatasetCard(card, {"train": 1}, 0, {"size": list(size)}, {}, 1, {})
+    return tiny.save_run(folder, recipe, data, change=disturb if model else lambda _: None)

@@ -10,7 +10,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_formats.check import check_dataset
 from acwm_play.recorder import Recording, save
 from acwm_play.simulator import TimeStep
-from tests.evaluation import tiny
+from tests import tiny
 
 CARD_OF_WORLD = tiny.Drift.card
 

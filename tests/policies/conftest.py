@@ -1,22 +1,22 @@
 import pytest
 import torch
 
-from tests.policies import slide
+from tests import tiny
 
 
 @pytest.fixture(scope="session", autouse=True)
 def parts():
     torch.set_num_threads(1)
-    slide.register()
+    tiny.register()
 
 
 @pytest.fixture(scope="session")
 def exact(parts, tmp_path_factory):
     """A run whose model knows its world; tests must not change it."""
-    return slide.make_run(tmp_path_factory.mktemp("exact") / "run")
+    return tiny.make_exact_run(tmp_path_factory.mktemp("exact") / "run")
 
 
 @pytest.fixture(scope="session")
 def blind(parts, tmp_path_factory):
     """A run whose model ignores actions; tests must not change it."""
-    return slide.make_run(tmp_path_factory.mktemp("blind") / "run", "blind")
+    return tiny.make_exact_run(tmp_path_factory.mktemp("blind") / "run", "blind")

@@ -12,8 +12,7 @@ from acwm_core.errors import AcwmError
 from acwm_core.training.run import load_run
 from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
-from tests.planning import tiny
-from tests.policies import slide
+from tests import tiny
 
 MODULE = '''
 import numpy as np
@@ -96,7 +95,7 @@ def module(tmp_path, monkeypatch):
 def stages(exact):
     bundle = load_run(exact)
     reader = tiny.SquareEstimator(bundle.card)
-    simulator = SimulatorJudge(tiny.environment(), 1, slide.STRIDE, reader)
+    simulator = SimulatorJudge(tiny.task_environment(), 1, tiny.STRIDE, reader)
     return simulator, ModelJudge(bundle.world_model, reader, tiny.PLACE)
 
 

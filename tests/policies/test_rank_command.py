@@ -72,8 +72,8 @@ def test_bad_words_are_one_sentence(mine, capsys, words, message):
 
 
 def test_a_world_without_an_estimator_cannot_be_judged(tmp_path, capsys):
-    from tests.policies import slide
+    from tests import tiny
 
-    run = slide.make_run(tmp_path / "run", environment="unread")
+    run = tiny.make_exact_run(tmp_path / "run", environment="unread")
     code, _, err = acwm(capsys, "rank", run, "place")
     assert (code, "no estimator reads the states of unread" in err) == (2, True)

@@ -14,15 +14,14 @@ from acwm_planning.policies.run import Ranker, rank_policies
 from acwm_planning.policies.scripted import ScriptedPolicy, built_in_policies
 from acwm_planning.policies.table import summarise
 from acwm_planning.resumable import ResumableResults
-from tests.planning import tiny
-from tests.policies import slide
+from tests import tiny
 
 SEEDS = range(6)
 
 
 def simulator(given=1):
     reader = tiny.SquareEstimator(tiny.Slide.card)
-    return SimulatorJudge(tiny.environment(), given, slide.STRIDE, reader)
+    return SimulatorJudge(tiny.task_environment(), given, tiny.STRIDE, reader)
 
 
 def ranked(tmp_path, model, policies=None, seeds=SEEDS):
@@ -94,7 +93,7 @@ def test_a_model_sees_the_actions_that_were_taken(exact):
 
 def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
     """A model that is given five frames: the same outcome as one that is given one."""
-    run = slide.make_run(tmp_path / "run", context_frames=5)
+    run = tiny.make_exact_run(tmp_path / "run", context_frames=5)
     bundle = load_run(run)
     reader = tiny.SquareEstimator(bundle.card)
     start = simulator(given=5).start(tiny.spec(1))
@@ -103,7 +102,9 @@ def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
     assert start.actions.shape == (4, 2)
     rows = [np.full((12, 2), 1.5, np.float32), np.full((12, 2), -1.0, np.float32)]
     made = ModelJudge(bundle.world_model, reader, tiny.PLACE).replay(start, rows)
-    single = ModelJudge(load_run(slide.make_run(tmp_path / "one")).world_model, reader, tiny.PLACE)
+    single = ModelJudge(
+        load_run(tiny.make_exact_run(tmp_path / "one")).world_model, reader, tiny.PLACE
+    )
     assert made == single.replay(simulator().start(tiny.spec(1)), rows)
 
 

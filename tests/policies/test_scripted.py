@@ -15,13 +15,13 @@ from acwm_planning.policies.scripted import (
     is_solvable,
     parse_policy,
 )
-from tests.planning import tiny
+from tests import tiny
 
 STEPS = 12
 
 
 def stage(seed=0, task=tiny.PLACE):
-    made = tiny.environment(task)
+    made = tiny.task_environment(task)
     made.reset(options={"spec": tiny.spec(seed)})
     return made
 

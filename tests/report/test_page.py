@@ -24,7 +24,7 @@ from acwm_report.page import write_report
 from acwm_report.run import EvaluatedRun
 from acwm_report.table import Scale
 from acwm_report.videos import action_traces
-from tests.evaluation import tiny
+from tests import tiny
 from tests.report import synthetic
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}

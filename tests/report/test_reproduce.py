@@ -14,7 +14,7 @@ from acwm_report.page import write_report
 from acwm_report.reproduce import commands
 from acwm_severity.curves import read_severity
 from acwm_severity.sweep import sweep_severity
-from tests.evaluation import tiny
+from tests import tiny
 
 SWEEP = "factors.colour=200,90"
 

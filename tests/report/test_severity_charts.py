@@ -10,7 +10,7 @@ import pytest
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_report.page import export_report, write_report
 from acwm_severity.sweep import sweep_severity
-from tests.evaluation import tiny
+from tests import tiny
 
 CURVE = "run1-severity-colour"
 VALUES = "factors.colour=200,90"

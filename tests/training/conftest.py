@@ -2,14 +2,13 @@ import pytest
 import torch
 
 from acwm_core.data.generate import generate
-from acwm_core.plugins import catalog
-from tests.training.tiny import TinyPlugin
+from tests.tiny import register
 
 
 @pytest.fixture(scope="session", autouse=True)
 def tiny_parts():
     """The tiny parts, registered as a plugin of this process."""
-    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    register()
 
 
 @pytest.fixture(scope="session")

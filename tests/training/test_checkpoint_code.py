@@ -12,7 +12,7 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_details, read_shares, read_whole, write_folder
 from acwm_core.training.fit import fit
-from tests.training.tiny import tiny_recipe
+from tests.tiny import tiny_recipe
 
 FORMATS = dcp.metadata._MEM_FORMAT_ENCODING
 

@@ -22,7 +22,7 @@ from acwm_core.training.checkpoints import (
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.sharding import ShardedStrategy
-from tests.training.tiny import tiny_world_model
+from tests.tiny import tiny_world_model
 
 
 class Died(BaseException):

@@ -15,8 +15,8 @@ from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.fit import fit
 from acwm_core.training.memory import state_memory
 from acwm_core.training.run import RunFolder, load_run, read_metadata
+from tests.tiny import tiny_recipe
 from tests.training.test_fit import numbers
-from tests.training.tiny import tiny_recipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,7 +36,7 @@ def two(strategy, batch_size=2, **more):
 
 
 def callback(name, **init_args):
-    return {"class_path": f"tests.training.tiny.{name}", "init_args": init_args}
+    return {"class_path": f"tests.training.callbacks.{name}", "init_args": init_args}
 
 
 def in_two_processes(data, jobs):

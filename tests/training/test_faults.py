@@ -23,8 +23,9 @@ from acwm_core.training.checkpoints import read_details
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from tests.plugins import plugin_of
+from tests.tiny import TinyModel, tiny_recipe
+from tests.training.callbacks import Kill
 from tests.training.test_fit import killable, killed_run, weights
-from tests.training.tiny import Kill, TinyModel, tiny_recipe
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,15 @@ from acwm_core.training.module import VALIDATION_NOISE, generator_of
 from acwm_core.training.run import RunFolder, load_run, read_metadata
 from acwm_core.training.trainer import automatic_precision
 from acwm_metrics.torchmetrics import as_torchmetric
-from tests.training.tiny import Kill, Killed, tiny_recipe
+from tests.tiny import tiny_recipe
+from tests.training.callbacks import Kill, Killed
 
 OF_ROLLOUTS = {"val/psnr", "val/ssim", "val/psnr_over_first_frame"}
 
 
 def killable(data, /, **sections):
     """A recipe with dropout, several passes over the data and a callback that can kill it."""
-    trainer = {"callbacks": [{"class_path": "tests.training.tiny.Kill"}]}
+    trainer = {"callbacks": [{"class_path": "tests.training.callbacks.Kill"}]}
     return tiny_recipe(data, trainer={**trainer, **sections.pop("trainer", {})}, **sections)
 
 
@@ -235,7 +236,7 @@ def test_ctrl_c_says_how_to_go_on(whole, data, tmp_path, monkeypatch):
 
 def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(data, tmp_path):
     for batch, message in ((1, "nothing was saved yet"), (7, r"last\.ckpt is the last good")):
-        poison = {"class_path": "tests.training.tiny.Poison", "init_args": {"batch": batch}}
+        poison = {"class_path": "tests.training.callbacks.Poison", "init_args": {"batch": batch}}
         recipe = tiny_recipe(data, trainer={"callbacks": [poison]})
         run = RunFolder(tmp_path / f"run-{batch}")
         with pytest.raises(TrainingError, match=rf"not finite in step {batch} \(.*{message}"):

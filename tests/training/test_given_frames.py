@@ -10,9 +10,9 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
+from tests.tiny import TinyModel, tiny_recipe
 from tests.training.test_fit import numbers
 from tests.training.test_short_episodes import short  # noqa: F401 - a fixture
-from tests.training.tiny import TinyModel, tiny_recipe
 
 STEPS = {"max_steps": 4}
 
@@ -91,7 +91,7 @@ def test_clips_may_begin_with_their_episodes_and_follow_each_other(
     """Each batch of four has four first actions; those of these clips, no others."""
     (tmp_path / "seen").mkdir()
     witness = {
-        "class_path": "tests.training.tiny.Witness",
+        "class_path": "tests.training.callbacks.Witness",
         "init_args": {"folder": str(tmp_path / "seen")},
     }
     recipe = tiny_recipe(

@@ -8,8 +8,9 @@ import torch
 from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
+from tests.tiny import tiny_recipe
+from tests.training.callbacks import Kill
 from tests.training.test_fit import assert_same, killable, killed_run
-from tests.training.tiny import Kill, tiny_recipe
 
 
 @pytest.fixture(scope="module")

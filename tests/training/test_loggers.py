@@ -3,7 +3,7 @@ import csv
 from acwm_core import executors
 from acwm_core.training.fit import fit
 from acwm_core.training.loggers import MetricsFile
-from tests.training.tiny import tiny_recipe
+from tests.tiny import tiny_recipe
 
 
 def rows(path):

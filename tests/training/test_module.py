@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.module import TrainingModule, generator_of, seed_of
 from acwm_core.training.optimizers import parameter_groups
-from tests.training.tiny import tiny_world_model
+from tests.tiny import tiny_world_model
 
 
 def test_noise_depends_on_every_part_of_its_key_and_on_nothing_else():

@@ -9,7 +9,7 @@ from acwm_core.errors import MissingExtraError, RecipeError
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
-from tests.training.tiny import tiny_recipe
+from tests.tiny import tiny_recipe
 
 CLASS = "lightning.pytorch.loggers.CSVLogger"
 

@@ -23,8 +23,8 @@ from acwm_core.training.optimizers import (
     parameter_groups,
 )
 from acwm_core.training.run import RunFolder
+from tests.tiny import tiny_recipe, tiny_world_model
 from tests.training.test_fit import numbers
-from tests.training.tiny import tiny_recipe, tiny_world_model
 
 
 class Network(nn.Module):

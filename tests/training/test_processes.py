@@ -13,8 +13,8 @@ import pytest
 
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run, read_metadata
+from tests.tiny import tiny_recipe
 from tests.training.test_fit import assert_same, numbers
-from tests.training.tiny import tiny_recipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,7 +35,7 @@ def train(data, run, /, *, resume="", spared=False, **sections):
 
 
 def callback(name, **init_args):
-    return {"class_path": f"tests.training.tiny.{name}", "init_args": init_args}
+    return {"class_path": f"tests.training.callbacks.{name}", "init_args": init_args}
 
 
 def test_killed_by_sigkill_and_resumed_in_silence(data, tmp_path):

@@ -16,9 +16,10 @@ from acwm_core.renamed import RenamedWarning
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
+from tests.tiny import TinyCodec, tiny_recipe
+from tests.training.callbacks import Kill, Killed
 from tests.training.test_fit import assert_same
 from tests.training.test_processes import TWO, train
-from tests.training.tiny import Kill, Killed, TinyCodec, tiny_recipe
 
 VIDEO = {"cache_latents": False}
 
@@ -76,7 +77,7 @@ def test_skip_damaged_is_told_to_be_gone(shards):
 
 
 def test_a_run_that_damage_ended_goes_on_when_it_is_mended(shards, tmp_path, monkeypatch):
-    recipe = {"trainer": {"callbacks": [{"class_path": "tests.training.tiny.Kill"}]}}
+    recipe = {"trainer": {"callbacks": [{"class_path": "tests.training.callbacks.Kill"}]}}
     whole = RunFolder(fit(tiny_recipe(shards, data=VIDEO, **recipe), tmp_path / "whole"))
     run = tmp_path / "run"
     monkeypatch.setattr(Kill, "batch", 10)

@@ -6,8 +6,8 @@ from acwm_core.data import remote
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
 from tests.data.serving import served
+from tests.tiny import tiny_recipe
 from tests.training.test_fit import assert_same
-from tests.training.tiny import tiny_recipe
 
 
 def test_a_run_on_a_url_is_the_run_on_the_folder(data, tmp_path, monkeypatch):

@@ -6,8 +6,8 @@ import torch
 
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
+from tests.training.callbacks import Kill
 from tests.training.test_fit import killable, killed_run
-from tests.training.tiny import Kill
 
 OFTEN = {"validate_every_n_steps": 1, "checkpoint_every_n_steps": 1}
 

@@ -10,7 +10,7 @@ import torch
 from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run, load_weights, read_metadata, save_weights
-from tests.training.tiny import tiny_recipe, tiny_world_model
+from tests.tiny import tiny_recipe, tiny_world_model
 
 
 @pytest.fixture(scope="module")

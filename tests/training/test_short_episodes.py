@@ -11,8 +11,8 @@ from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, load_run
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
+from tests.tiny import TinyCodec, TinyModel, tiny_recipe
 from tests.training.test_fit import numbers
-from tests.training.tiny import TinyCodec, TinyModel, tiny_recipe
 
 FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
 

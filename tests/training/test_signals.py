@@ -10,12 +10,12 @@ from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, read_metadata
 from acwm_core.training.signals import SIGNALS, StoppedEarly
+from tests.tiny import tiny_recipe
 from tests.training.test_fit import assert_same, numbers
-from tests.training.tiny import tiny_recipe
 
 
 def signalled(data, /, *, accumulated=1, **init_args):
-    send = {"class_path": "tests.training.tiny.Signal", "init_args": init_args}
+    send = {"class_path": "tests.training.callbacks.Signal", "init_args": init_args}
     flags = {"callbacks": [send], "accumulate_grad_batches": accumulated}
     return tiny_recipe(data, trainer=flags)
 
@@ -102,7 +102,7 @@ def test_ctrl_c_saves_the_step_and_its_advice_is_true(whole, data, tmp_path, aga
 @pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_a_second_ctrl_c_does_not_wait(batch, whole, data, tmp_path, again):
     init_args = {"batch": batch, "number": int(signal.SIGINT)}
-    twice = [{"class_path": "tests.training.tiny.Signal", "init_args": init_args}] * 2
+    twice = [{"class_path": "tests.training.callbacks.Signal", "init_args": init_args}] * 2
     recipe, run = tiny_recipe(data, trainer={"callbacks": twice}), RunFolder(tmp_path / "run")
     with pytest.raises(StoppedEarly, match="interrupted; ") as stopped:
         fit(recipe, run.path)
@@ -132,7 +132,7 @@ def test_a_step_of_several_batches_is_finished(data, tmp_path, again):
 
 def test_a_run_that_is_to_stop_finishes_its_step(data, tmp_path, again):
     """After the first of three batches of step 5; then it goes on with no clip lost."""
-    stop = {"class_path": "tests.training.tiny.Stop", "init_args": {"batch": 12}}
+    stop = {"class_path": "tests.training.callbacks.Stop", "init_args": {"batch": 12}}
     recipe = tiny_recipe(data, trainer={"callbacks": [stop], "accumulate_grad_batches": 3})
     run = RunFolder(fit(recipe, tmp_path / "run"))
     assert read_metadata(run.weights)["step"] == 5

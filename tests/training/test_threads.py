@@ -10,7 +10,8 @@ from acwm_core.recipe import Recipe
 from acwm_core.training import threads
 from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder
-from tests.training.tiny import Kill, Killed, tiny_recipe
+from tests.tiny import tiny_recipe
+from tests.training.callbacks import Kill, Killed
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def asked(monkeypatch):
 
 def recipe_of(data, **training):
     training = {"cpu_threads": None, **training}
-    trainer = {"max_steps": 6, "callbacks": [{"class_path": "tests.training.tiny.Kill"}]}
+    trainer = {"max_steps": 6, "callbacks": [{"class_path": "tests.training.callbacks.Kill"}]}
     return tiny_recipe(data, training=training, trainer=trainer)
 
 

@@ -17,7 +17,7 @@ from acwm_core.training.progress import StepProgress
 from acwm_core.training.run import RunFolder
 from acwm_core.training.sharding import ShardedStrategy
 from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
-from tests.training.tiny import tiny_world_model
+from tests.tiny import tiny_world_model
 
 
 def build(ours=(), /, **flags) -> L.Trainer:

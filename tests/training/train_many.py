@@ -10,9 +10,8 @@ import os
 import sys
 
 from acwm_core.errors import AcwmError
-from acwm_core.plugins import catalog
 from acwm_core.training.fit import fit
-from tests.training.tiny import TinyPlugin, tiny_recipe
+from tests.tiny import register, tiny_recipe
 
 
 def outcome(data: str, job: dict) -> str | None:
@@ -29,7 +28,7 @@ def outcome(data: str, job: dict) -> str | None:
 
 
 def main(data: str, jobs: str) -> None:
-    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    register()
     outcomes = [outcome(data, job) for job in json.loads(jobs)]
     if os.environ.get("RANK", "0") == "0":
         print(json.dumps(outcomes))

@@ -7,13 +7,12 @@ import json
 import sys
 
 from acwm_core.errors import AcwmError
-from acwm_core.plugins import catalog
 from acwm_core.training.fit import fit
-from tests.training.tiny import TinyPlugin, tiny_recipe
+from tests.tiny import register, tiny_recipe
 
 
 def main(data: str, run: str, sections: str, resume: str | None = None) -> None:
-    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    register()
     try:
         fit(tiny_recipe(data, **json.loads(sections)), run, resume=resume)
     except AcwmError as error:

@@ -15,7 +15,6 @@ from pathlib import Path
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.plugins import catalog
 
 ROOM = "size=64m"
 
@@ -48,12 +47,8 @@ def tried(size, disk, before, words):
 if __name__ == "__main__":
     folder, sizes, before, *command = sys.argv[1:]
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    if "fit" in command:
-        from tests.training.tiny import TinyPlugin
-
-        catalog().add_plugin(TinyPlugin, "tiny_training_parts")
-    elif {"plan", "rank", "ship"} & {*command}:
-        from tests.planning.tiny import register
+    if {"fit", "plan", "rank", "ship"} & {*command}:
+        from tests.tiny import register
 
         register()
     for each in map(int, sizes.split(",")):

@@ -13,10 +13,8 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.files import disk_error, made_whole, written_whole
-from acwm_core.plugins import catalog
-from tests.planning import tiny as planning
 from tests.report.synthetic import clips, run
-from tests.training.tiny import TinyPlugin, tiny_recipe
+from tests.tiny import make_slide_run, register, tiny_recipe
 
 HERE = Path(__file__).parents[1] / "reference/first_release"
 
@@ -29,7 +27,7 @@ def results(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory):
     """Of the smallest parts there are, and their dataset."""
-    catalog().add_plugin(TinyPlugin, "tiny_training_parts")
+    register()
     folder = tmp_path_factory.mktemp("tiny")
     generate("tiny_world", folder / "data", episodes={"train": 4}, workers=0, progress=False)
     often = {"checkpoint_every_n_steps": 2, "validate_every_n_steps": 4, "sample_every_n_steps": 4}
@@ -41,9 +39,9 @@ def recipe(tmp_path_factory):
 @pytest.fixture(scope="module")
 def acting(tmp_path_factory):
     """A run whose model acts in a small world."""
-    planning.register()
+    register()
     torch.set_num_threads(1)
-    return planning.make_run(tmp_path_factory.mktemp("acting"), episodes=2)
+    return make_slide_run(tmp_path_factory.mktemp("acting"), episodes=2)
 
 
 @pytest.fixture(scope="module")

@@ -16,25 +16,22 @@ from acwm_core.training import fit as fitting
 from acwm_core.training import trained
 from acwm_core.training.fit import fit
 from acwm_planning.resumable import ResumableResults
+from tests import tiny
 from tests.experiment import parts as experiment
 from tests.folders import checksums
-from tests.planning import tiny as planning
 from tests.plugins import plugin_of
-from tests.training import tiny as training
 
 
 @pytest.fixture(scope="module", autouse=True)
 def parts():
     torch.set_num_threads(1)
-    planning.register()
+    tiny.register()
     # In the same process tests of data may have registered the square before.
     known = "square" in catalog().registry("environment")
     more = {"models": {"waiting": "tests.experiment.parts:WaitingModel"}}
     more |= {} if known else {"environments": {"square": "tests.data.square_world:Square"}}
-    plugins = {"tiny_training_parts": training.TinyPlugin, "experiments": plugin_of(**more)}
-    for name, plugin in plugins.items():
-        if name not in catalog().plugins:
-            catalog().add_plugin(plugin, name)
+    if "experiments" not in catalog().plugins:
+        catalog().add_plugin(plugin_of(**more), "experiments")
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +41,7 @@ def hurried(monkeypatch):
 
 @pytest.fixture(scope="module")
 def run(parts, tmp_path_factory):
-    return planning.make_run(tmp_path_factory.mktemp("run"))
+    return tiny.make_slide_run(tmp_path_factory.mktemp("run"))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +75,7 @@ def test_the_second_is_refused(run, tmp_path, monkeypatch, place, words):
 
 
 def recipe(data):
-    return training.tiny_recipe(data, trainer={"max_steps": 2})
+    return tiny.tiny_recipe(data, trainer={"max_steps": 2})
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +94,7 @@ def test_a_run_that_another_trained_since_it_was_looked_at_is_left(
     folder, usual = tmp_path / "run", fitting._callbacks
     if resumes:
         fit(recipe(data), folder)
-    longer = training.tiny_recipe(data, trainer={"max_steps": 4})
+    longer = tiny.tiny_recipe(data, trainer={"max_steps": 4})
     resume = folder if resumes else None
 
     def overtaken(*given):

@@ -12,10 +12,8 @@ from acwm_core.env.task import TaskEnvironment
 from acwm_core.errors import PluginError
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_planning.controllers import check_bounds
-from tests.core.tiny import SumConditioner
-from tests.evaluation import tiny
-from tests.evaluation.tiny import BlockCodec, Drift
-from tests.planning.tiny import Slide, SquareEstimator, ToPlace
+from tests import tiny
+from tests.tiny import BlockCodec, Drift, Slide, SquareEstimator, SumConditioner, ToPlace
 
 VIDEO = torch.zeros(1, 9, 3, 32, 32)
 

@@ -3,7 +3,7 @@ import torch
 
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
-from tests.evaluation import tiny
+from tests import tiny
 from tests.evaluation.test_given_frames import QUICK
 
 

@@ -21,7 +21,7 @@ from acwm_core.training.fit import fit
 from acwm_core.training.run import RunFolder, all_training, load_run, read_metadata, save_weights
 from acwm_zoo import packing
 from acwm_zoo.packing import pack
-from tests.evaluation import tiny
+from tests import tiny
 from tests.evaluation.test_given_frames import QUICK
 
 KEPT = {
