@@ -73,12 +73,12 @@ def data_folder(path: str | Path) -> Path:
 
 def _kept(url: str, fresh: Path, cache: Path) -> Path:
     """Fetch card and manifests into `fresh`; return the folder in `cache` with the same ones."""
-    _fetch(f"{url}/{CARD}", fresh / CARD)
+    fetch(f"{url}/{CARD}", fresh / CARD)
     names = [CARD]
     for split in DatasetCard.read(fresh).splits:
         (fresh / split).mkdir()
         names.append(f"{split}/{MANIFEST}")
-        _fetch(f"{url}/{names[-1]}", fresh / names[-1])
+        fetch(f"{url}/{names[-1]}", fresh / names[-1])
     contents = {name: (fresh / name).read_bytes() for name in names}
     digest = hashlib.sha256(url.encode())
     for data in contents.values():
@@ -110,16 +110,16 @@ def fetch_shard(url: str, path: Path, sha256: str) -> None:
     try:
         with alone(path):
             if not path.exists():
-                _fetch(url, path, sha256)
+                fetch(url, path, sha256)
     except OSError as error:
         raise DataError(
             f"cannot write {path} ({error.strerror}): make room, or set {CACHE} to another folder"
         ) from error
 
 
-def _fetch(url: str, path: Path, sha256: str | None = None) -> None:
+def fetch(url: str, path: Path, sha256: str | None = None) -> None:
     """Fetch one file, atomically; failures that may pass are retried."""
-    system, name = _located(url)
+    system, name = located(url)
     for wait in (*WAITS, None):
         try:
             with written_whole(path) as partial:
@@ -138,7 +138,7 @@ def _fetch(url: str, path: Path, sha256: str | None = None) -> None:
             time.sleep(wait)
 
 
-def _located(url: str) -> tuple[Any, str]:
+def located(url: str) -> tuple[Any, str]:
     """The fsspec file system of `url`, and the name of the file in it."""
     found = URL.match(url)
     protocol = found.group(1).lower() if found else ""

@@ -43,8 +43,8 @@ def to_rgb(
 ) -> NDArray[np.uint8]:
     """Convert an image to ``[H, W, 3]`` uint8.
 
-    Colours with opacity are laid on black. One channel of whole numbers of more than 8 bits is depth
-    in millimetres, and one of floats is depth in metres.
+    Colours with opacity are laid on black. One channel of whole numbers of more than 8 bits is
+    depth in millimetres, and one of floats is depth in metres.
 
     Args:
         depth_range: the distances in metres that become white and black; what is nearer or farther

@@ -1,0 +1,43 @@
+"""Names of files and datasets: their natural order, and one word for each."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from pathlib import Path
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """A key to sort names by, so that 2 comes before 10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def word(path: Path) -> str:
+    """The name of a file or folder as one word."""
+    name = path.resolve().name.partition(".")[0]
+    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
+
+
+def words(text: str | None) -> tuple[str, ...]:
+    """Names with a comma between."""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+def exact(rate: float) -> Fraction:
+    """A rate that was typed as a decimal; 29.97, 59.94 and the like are of NTSC."""
+    for whole in (24, 30, 48, 60, 120):
+        ntsc = Fraction(whole * 1000, 1001)
+        if abs(rate - ntsc) < 0.005:
+            return ntsc
+    return Fraction(rate).limit_denominator(10**6)
+
+
+def pair(numbers: tuple[int, ...] | None) -> tuple[float, float] | None:
+    """Two numbers that were typed, as a range."""
+    return None if numbers is None else (float(numbers[0]), float(numbers[1]))
+
+
+def typed(numbers: tuple[int, ...] | None) -> str | None:
+    """Numbers as they are typed."""
+    return None if numbers is None else ",".join(map(str, numbers))

@@ -1,0 +1,216 @@
+"""Tables of numbers beside a video: CSV, TSV, NPY, NPZ, JSON, JSONL and Parquet, by column."""
+
+from __future__ import annotations
+
+import importlib
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError, suggest
+from acwm_core.files import parse_json
+
+arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
+
+Table = Mapping[str, NDArray[Any]]
+"""Columns ``[N]`` by name, all of the same length; a vector is a column ``NAME_i`` per entry."""
+
+SECONDS = {"_ns": 1e-9, "_us": 1e-6, "_ms": 1e-3, "_s": 1.0, "": 1.0}
+"""Length of a unit of time in seconds, by the end of the column's name."""
+
+TIMES = ("time", "timestamp", "timestamps", "t", "seconds", "stamp")
+FRAMES = ("frame", "frame_index", "frame_id")
+EPISODES = ("episode", "episode_index", "episode_id", "video", "file", "filename")
+"""Names of columns that are no actions, without the unit at their end."""
+
+
+def read_table(path: Path) -> Table:
+    """Read the columns of a table; columns without a name are left out.
+
+    Raises:
+        DataError: the file is missing, damaged, empty or ragged.
+    """
+    try:
+        rows = READERS[path.suffix.lower()](path)
+    except FileNotFoundError:
+        raise DataError(f"there is no {path}") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, arrow.ArrowException) as e:
+        reason = " ".join(str(e).split())[:200] or type(e).__name__
+        raise DataError(f"the table {path} cannot be read ({reason})") from e
+    columns: dict[str, NDArray[Any]] = {}
+    for name, values in rows.items():
+        columns |= _split(name, values)
+    if len({len(values) for values in columns.values()}) > 1:
+        lengths = {name: len(values) for name, values in columns.items()}
+        raise DataError(f"the columns of {path} differ in length: {lengths}")
+    if not any(map(len, columns.values())):
+        raise DataError(f"the table {path} holds no row")
+    return {name: values for name, values in columns.items() if name}
+
+
+def numbers(table: Table, names: Sequence[str], path: Path) -> NDArray[np.float64]:
+    """The columns `names` as ``[N, len(names)]``.
+
+    Raises:
+        DataError: there is no such column, or it holds something else than finite numbers.
+    """
+    return np.stack([number_column(table, name, path) for name in names], 1)
+
+
+def number_column(table: Table, name: str, path: Path) -> NDArray[np.float64]:
+    """One column ``[N]``; errors as in `numbers`."""
+    if name not in table:
+        raise DataError(f"{path} has no column {name!r}{suggest(name, table)}")
+    column = table[name]
+    if column.dtype.kind not in "fiub":
+        example = next((value for value in column.tolist() if not _is_number(value)), None)
+        raise DataError(f"the column {name} of {path} holds {example!r}, which is not a number")
+    values = column.astype(np.float64)
+    if len(bad := np.flatnonzero(~np.isfinite(values))):
+        raise DataError(
+            f"the column {name} of {path} has no finite number in row {bad[0]} (counted from 0)"
+        )
+    return values
+
+
+def holds_numbers(column: NDArray[Any]) -> bool:
+    """Whether a column holds numbers, at least some: one wrong word does not make it text."""
+    return column.dtype.kind in "fiub" or any(_is_number(value) for value in column.tolist())
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def special_column(table: Table, names: Sequence[str]) -> str | None:
+    """The first column that has one of `names`, perhaps with a unit of time at its end."""
+    return next((name for name in table if _bare(name) in names), None)
+
+
+def action_columns(table: Table) -> list[str]:
+    """The columns that are neither times nor numbers of frames or episodes."""
+    return [name for name in table if _bare(name) not in (*TIMES, *FRAMES, *EPISODES)]
+
+
+def seconds(table: Table, name: str, path: Path) -> NDArray[np.float64]:
+    """A column of times in seconds; its unit is told by the end of its name, as in ``time_ms``.
+
+    Raises:
+        DataError: it is missing, or holds something else than finite numbers.
+    """
+    unit = next(unit for ending, unit in SECONDS.items() if name.lower().endswith(ending))
+    values = number_column(table, name, path)
+    whole = table[name].astype(np.int64) if table[name].dtype.kind in "iu" else None
+    if whole is None or unit == 1.0:
+        return values * unit
+    first = whole[0] // round(1 / unit)  # nanoseconds since 1970 exceed what a float can tell
+    return (whole - first * round(1 / unit)) * unit + float(first)
+
+
+def _bare(name: str) -> str:
+    lower = name.lower().strip()
+    for ending in ("_ns", "_us", "_ms", "_s"):
+        lower = lower.removesuffix(ending)
+    return lower
+
+
+def _split(name: str, values: Any) -> dict[str, NDArray[Any]]:
+    """A column of vectors as one column per entry."""
+    array = np.asarray(values)
+    if array.ndim == 1:
+        return {name: array}
+    if array.ndim != 2:
+        raise DataError(f"{name or 'the array'} is {array.shape}: a table has one or two axes")
+    base = name or "action"
+    return {f"{base}_{place}": array[:, place] for place in range(array.shape[1])}
+
+
+def _csv(path: Path) -> dict[str, Any]:
+    csv: Any = importlib.import_module("pyarrow.csv")
+    with path.open("rb") as file:
+        head = file.readline()
+    delimiter = max((",", ";", "\t"), key=lambda each: head.count(each.encode()))
+    kept = csv.ConvertOptions(strings_can_be_null=True)
+    with path.open("rb") as file:
+        table = csv.read_csv(
+            file, parse_options=csv.ParseOptions(delimiter=delimiter), convert_options=kept
+        )
+    return _columns(table)
+
+
+def _parquet(path: Path) -> dict[str, Any]:
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    with path.open("rb") as file:
+        return _columns(parquet.read_table(file))
+
+
+def _columns(table: Any) -> dict[str, Any]:
+    """The columns of an Arrow table; an empty field is NaN among numbers."""
+    types = arrow.types
+    found: dict[str, Any] = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if types.is_nested(column.type):
+            found[name] = np.array(column.to_pylist())
+        elif types.is_temporal(column.type):
+            raise ValueError(f"the column {name} holds dates, not numbers: write times in seconds")
+        else:
+            found[name] = column.to_numpy()
+    return found
+
+
+def _npy(path: Path) -> dict[str, Any]:
+    return {"": np.load(path, allow_pickle=False)}
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return _records(parse_json(path.read_bytes()))
+
+
+def _jsonl(path: Path) -> dict[str, Any]:
+    lines = path.read_bytes().splitlines()
+    return _records([parse_json(line) for line in lines if line.strip()])
+
+
+def _records(value: Any) -> dict[str, Any]:
+    """Columns of a dict of lists, a list of objects with the same keys, or a list of rows."""
+    if isinstance(value, dict):
+        return cast(dict[str, Any], value)
+    if not isinstance(value, list) or not value:
+        raise ValueError("it is neither a list of rows nor an object of columns")
+    rows = cast(list[Any], value)
+    if not isinstance(rows[0], dict):
+        return {"": np.array(rows)}
+    names = list(cast(dict[str, Any], rows[0]))
+    for place, row in enumerate(rows):
+        if not isinstance(row, dict) or [*cast(dict[str, Any], row)] != names:
+            raise ValueError(f"row {place} (counted from 0) has other columns than the first")
+    return {name: np.array([_nan(row[name]) for row in rows]) for name in names}
+
+
+def _nan(value: Any) -> Any:
+    return float("nan") if value is None else value
+
+
+READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ".csv": _csv,
+    ".tsv": _csv,
+    ".npy": _npy,
+    ".npz": _npz,
+    ".json": _json,
+    ".jsonl": _jsonl,
+    ".parquet": _parquet,
+}
+"""Reads the columns of a file, by the end of its name."""
