@@ -69,15 +69,19 @@ def write_clip(path, numbers, times, rate, clip, size=SIZE):
             stream.codec_context.sample_aspect_ratio = clip.aspect
         if clip.rotation:
             stream.set_display_rotation(clip.rotation)
-        for number, time in zip(numbers, times, strict=True):
+        ticks = [round(Fraction(time) / tick) for time in times]
+        orderly = len({*ticks}) == len(ticks)  # an encoder takes no two frames of one moment
+        for place, number in enumerate(numbers):
             frame = stored(number, clip, size)
-            frame.pts, frame.time_base = round(Fraction(time) / tick), tick
-            _mux(output, stream, frame, clip)
-        _mux(output, stream, None, clip)
+            frame.pts, frame.time_base = ticks[place] if orderly else place, tick
+            _mux(output, stream, frame, clip, None if orderly else ticks)
+        _mux(output, stream, None, clip, None if orderly else ticks)
 
 
-def _mux(output, stream, frame, clip):
+def _mux(output, stream, frame, clip, ticks):
     for packet in stream.encode(frame):
+        if ticks is not None:
+            packet.pts = packet.dts = ticks[packet.pts]
         step = round(1 / (stream.average_rate * packet.time_base))
         packet.pts += clip.shift * step
         packet.dts += clip.shift * step
