@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 SAME = 0.005  # rates that differ by this share are the same, since clocks differ
 QUARTER = 0.25  # of a frame: so far may times drift away from a rate over a whole recording
 JITTER = 0.35  # of a frame: so far may a frame be from its regular time
+HALF = 0.5  # of a frame: farther off, a frame could as well be the next one
 LATE = 1.75  # intervals after a frame at which the next one is certain to be missing
 
 
@@ -57,7 +58,7 @@ def cadence(times: NDArray[np.float64]) -> Cadence:
         slots = slots.astype(np.int64)
         start, step = _line(slots, times)
     off = np.abs(times - start - step * slots).max() / step
-    why = f"one is {off:.2g} frame intervals off its time" if off > 2 * JITTER else ""
+    why = f"one is {off:.2g} frame intervals off its time" if off > HALF else ""
     late = round(float(times[0]) / step)  # unless the clock began long before
     return Cadence(slots, step, late if 0 < late <= len(times) else 0, why)
 
