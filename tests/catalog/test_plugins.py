@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from acwm_core.errors import MissingExtraError, PluginError, RecipeError, suggest
-from acwm_core.plugins import Registry, hookimpl
+from acwm_core.plugins import Catalog, Registry, hookimpl
 from tests.catalog.installing import REFERENCE, Install, loaded, reasons, unharmed
+from tests.plugins import plugin_of
 
 
 def test_the_builtin_plugins_load() -> None:
@@ -65,33 +66,6 @@ def test_one_with_a_misspelt_hook(install: Install) -> None:
     catalog = loaded()
     assert "register_codec" in reasons(catalog)["plugin_misspelt"]
     assert unharmed(catalog)
-
-
-def test_one_of_a_taken_plugin_name(install: Install) -> None:
-    install(
-        "plugin_twice",
-        """
-        @hookimpl
-        def register_codecs(registry):
-            registry.add("twice", "plugin_twice:Codec")
-        """,
-        entry_point="acwm_dit",
-    )
-    catalog = loaded()
-    assert "already loaded" in reasons(catalog)["acwm_dit"]
-    assert len(catalog.problems) == 1
-
-
-def test_one_whose_target_is_malformed(install: Install) -> None:
-    install(
-        "plugin_target",
-        """
-        @hookimpl
-        def register_codecs(registry):
-            registry.add("bad", "plugin_target.Codec")
-        """,
-    )
-    assert "is not 'module:Name'" in reasons(loaded())["plugin_target"]
 
 
 def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
@@ -169,3 +143,13 @@ def test_unknown_names_suggest_the_nearest() -> None:
     with pytest.raises(RecipeError, match=r"unknown codec 'zzz'; known: .*compact"):
         REFERENCE.component("codec", "zzz")
     assert suggest("place", ["palace", "push_cube.place"]) == "; did you mean 'push_cube.place'?"
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_task_reaches_its_environment_whichever_plugin_comes_first(order: int) -> None:
+    catalog = Catalog()
+    environments = plugin_of(environments={"there": "theirs:There"})
+    tasks = plugin_of(tasks={"there.tidy": "mine:TIDY"})
+    for plugin, name in [(environments, "environments"), (tasks, "tasks")][::order]:
+        catalog.add_plugin(plugin, name)
+    assert catalog.component("environment", "there").tasks == {"tidy": "mine:TIDY"}

@@ -45,15 +45,3 @@ def test_an_unknown_name_tells_of_plugins_that_were_left_out():
     with pytest.raises(RecipeError, match=r"'acwm_broken' was left out: No module named"):
         catalog.component("codec", "mine")
     assert catalog.component("codec", "fine").target == "somewhere:Fine"
-
-
-@pytest.mark.parametrize("task_first", [True, False])
-def test_a_task_reaches_its_environment_whichever_plugin_comes_first(task_first):
-    catalog = Catalog()
-    parts = [
-        (plugin_of(tasks={"there.tidy": "mine:TIDY"}), "tasks"),
-        (plugin_of(environments={"there": "theirs:There"}), "environments"),
-    ]
-    for plugin, name in parts if task_first else parts[::-1]:
-        catalog.add_plugin(plugin, name)
-    assert catalog.component("environment", "there").tasks == {"tidy": "mine:TIDY"}

@@ -83,33 +83,23 @@ def test_a_saved_recipe_reads_back_the_same(recipe: Path, tmp_path: Path) -> Non
 
 
 WRONG = {
-    "model=dit_z": "unknown model 'dit_z'; did you mean 'dit_",
     "env=push_cub": "unknown environment 'push_cub'; did you mean 'push_cube'?",
     "conditioner=cross_atention": "did you mean 'cross_attention'?",
-    "evaluation.metrics=[psrn]": "unknown metric 'psrn'; did you mean 'psnr'?",
     "modle=dit_s": "unknown section 'modle'; did you mean 'model'?",
     "model.layer=4": "model.layer=4: DiT has no parameter 'layer'; did you mean 'layers'?",
-    "model.layers=four": "model.layers=four: expected int",
-    "model.causal=1": "model.causal=1: expected bool or null",
     "model.latent_channels=4": "model.latent_channels follows from the other components; omit it",
     "conditioner.width=4": "conditioner.width follows from the other components; omit it",
     "codec.dept=1": "no parameter 'dept'",
     "codec=plain": "Codec needs the parameter 'depth'; add codec.depth=…",
-    "codec=preset codec.sizes=[a]": 'codec.sizes=["a"]: expected [int, …]',
     "codec=nowhere": "but tests.recipe.test_recipe has no 'Missing'",
     "codec=": "names no codec; add codec=NAME",
-    "codec=[compact]": "names no codec",
     "training=5": "training=5: give parameters, as in training.parameter=value",
-    "objective.prediction=cleen": "expected 'velocity' or 'clean'; did you mean 'clean'?",
-    "objective.shift=high": "objective.shift=high: expected float",
     "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
-    "training.learning_rat=1": "did you mean 'learning_rate'?",
     "training.max_steps=10": "has no parameter 'max_steps'; did you mean trainer.max_steps?",
     "model.learning_rate=1": "'learning_rate'; did you mean training.learning_rate?",
     "data.batch_size=0": "data.batch_size=0 must be at least 1",
     "evaluation.metrics=psnr": "evaluation.metrics=psnr: expected [str or dict[str, Any], …]",
     "evaluation.metrics=[psn]": "unknown metric 'psn'; did you mean 'psnr'?",
-    'evaluation.metrics=[{"name":"psn"}]': "unknown metric 'psn'; did you mean 'psnr'?",
     'evaluation.metrics=[{"as":"other"}]': "names no metric; write {name: METRIC",
     'evaluation.metrics=[lpips,{"name":"lpips","network":"vgg"}]': "lists 'lpips' twice",
     'evaluation.metrics=[{"name":"lpips","as":"the.net"}]': "'the.net' is not a valid name",
@@ -124,7 +114,6 @@ WRONG = {
     'evaluation.metrics=[{"name":"torchmetrics.image.VisualInformationFidelity","sigma":1}]': (
         "VisualInformationFidelity has no parameter 'sigma'; did you mean 'sigma_n_sq'?"
     ),
-    "data.path=": "data.path=null: expected str",
     "trainer.max_step=5": "Trainer has no parameter 'max_step'; did you mean 'max_steps'?",
 }
 

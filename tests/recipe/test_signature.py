@@ -1,15 +1,20 @@
-"""What a constructor takes, and what it passes on."""
+"""What a constructor takes and passes on, and values against types, strictly."""
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import pytest
 import torch
 from lightning.pytorch import Trainer
 
+from acwm_core.errors import RecipeError
 from acwm_core.recipe.signature import REQUIRED, Parameter, signature
+from acwm_core.recipe.types import checked, describe
 from acwm_core.training.config import TRAINER_FLAGS
 
 if TYPE_CHECKING:
@@ -92,3 +97,53 @@ def test_types_that_cannot_be_resolved_accept_anything():
 
 def test_the_flags_of_the_trainer_are_lightnings():
     assert [*TRAINER_FLAGS] == [*inspect.signature(Trainer).parameters]
+
+
+@pytest.mark.parametrize(
+    ("value", "expected", "result"),
+    [
+        (5, float, 5.0),
+        ([1, 2], tuple[int, int], (1, 2)),
+        ([1], Sequence[int], [1]),
+        ("runs/x", Path, Path("runs/x")),
+        ("a", Literal["a", "b"], "a"),
+        (None, int | None, None),
+        ({"class_path": "x.Y"}, str | Any, {"class_path": "x.Y"}),
+        ({"a": 1}, dict[str, int], {"a": 1}),
+    ],
+)
+def test_values_take_their_type(value, expected, result):
+    taken = checked("x", value, expected)
+    assert taken == result
+    assert type(taken) is type(result)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected", "message"),
+    [
+        ("5", int, "model.x=5: expected int"),
+        (1.5, int, "model.x=1.5: expected int"),
+        (True, int, "model.x=true: expected int"),
+        (1, bool, "model.x=1: expected bool"),
+        (None, str, "model.x=null: expected str"),
+        ([1, 2, 3], tuple[int, int], "model.x=[1, 2, 3]: expected [int, int]"),
+        ("x", tuple[int, ...] | None, "model.x=x: expected [int, …] or null"),
+        ("cleen", Literal["clean", "velocity"], "did you mean 'clean'?"),
+        ("q", Literal["clean", "velocity"] | None, "expected 'clean' or 'velocity' or null"),
+    ],
+)
+def test_wrong_types_are_refused(value, expected, message):
+    with pytest.raises(RecipeError) as error:
+        checked("model.x", value, expected)
+    assert message in str(error.value)
+
+
+def test_types_without_a_schema_are_left_to_the_constructor():
+    class Own: ...
+
+    assert checked("x", 3, Own) == 3
+
+
+def test_descriptions():
+    assert describe(dict[str, list[int]] | None) == "dict[str, [int, …]] or null"
+    assert describe(Callable) == "Callable"

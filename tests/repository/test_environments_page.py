@@ -36,15 +36,3 @@ def test_its_pictures_are_all_there_and_no_others(text, found):
     kept = {f"environments/{path.name}" for path in (DOCS / "environments").iterdir()}
     assert set(re.findall(r"\]\((environments/[^)]+)\)", shown)) == kept, "run: make docs"
     assert sum((DOCS / name).stat().st_size for name in kept) <= 3 * 2**20
-
-
-def test_every_world_has_its_tables(text, found):
-    sections = text.sections(found)
-    for name, card in found.items():
-        assert re.search(rf"^##+ {name}$", sections, re.M)
-        for factor in card.factors:
-            assert factor.description in sections
-        for field in card.state:
-            assert f"`{field.name}`" in sections
-        for action, unit in zip(card.action.names, card.action.units, strict=True):
-            assert f"| `{action}` | {unit or '–'} |" in sections

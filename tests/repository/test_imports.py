@@ -17,6 +17,8 @@ MISSPELT = [
     "show push_cube_small data.batch_size=x",
     "show push_cube_small evaluation.metrics=[psrn]",
     "show push_cube_small trainer.max_step=1",
+    "fit push_cube_small training.sed=3",
+    "evaluate tests/reference/first_release/run evaluation.step=3",
 ]
 TOLD = ["--help", "list", "fit --help", "generate --help"]
 MODULES = ["recipe", "plugins", "env.environment", "env.episode", "env.task", "training.config"]

@@ -2,16 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch.nn import functional
 
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import Cache, Denoiser, LatentStream
-from acwm_core.model.objectives.flow import FlowMatching
-from acwm_core.model.objectives.objective import drawn_noise
+from acwm_core.model.objectives.flow import FlowMatching, FlowStream
 from acwm_core.model.shapes import Latent, Sigmas
+
+
+class _Stream(FlowStream["DiffusionForcing"]):
+    """Samples latent frames one after the other, each with the cached past.
+
+    A finished latent frame is evaluated once more, clean, so that later frames can attend to it.
+    This is done in the same evaluation as the first one of the next frame.
+    """
+
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """Sample the next latent frame; see `LatentStream.advance`."""
+        last, done, is_kept = self.last, self.last.shape[1], False
+        alone = conditioning.frames(done, done + 1)
+
+        def extend(noisy: Latent, sigma: Sigmas, actions: Conditioning) -> Latent:
+            inputs = self.objective.sampling_inputs(sigma, self.steps)
+            return self.model.extend(noisy, sigma, actions, self.cache, **inputs)
+
+        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
+            nonlocal is_kept
+            if is_kept:
+                return extend(noisy, sigma, alone)
+            pair = torch.cat([last, noisy], 1)
+            predicted = extend(pair, functional.pad(sigma, (done, 0)), conditioning)
+            self.cache.keep(done)
+            is_kept = True
+            return predicted[:, done:]
+
+        noise = self.noise()
+        self.last = self.objective.sample(evaluate, noise, noise[:, :0], self.steps)
+        return self.last
 
 
 class DiffusionForcing(FlowMatching):
@@ -22,61 +49,4 @@ class DiffusionForcing(FlowMatching):
     """
 
     causal = True
-
-    def stream(
-        self,
-        model: Denoiser,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        *,
-        steps: int | None = None,
-        context: int,
-    ) -> LatentStream:
-        """Sample frame by frame with a cache; see `Objective.stream`."""
-        return _DenoisedStream(self, model, given, generators, steps, model.new_cache(context))
-
-
-class _DenoisedStream(LatentStream):
-    """Samples latent frames one after the other, each with the cached past.
-
-    A finished latent frame is evaluated once more, clean, so that later frames can attend to it.
-    This is done in the same evaluation as the first one of the next frame.
-    """
-
-    def __init__(
-        self,
-        objective: FlowMatching,
-        model: Denoiser,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        steps: int | None,
-        cache: Cache,
-    ) -> None:
-        self._objective, self._steps = objective, steps
-        self._model, self._cache = model, cache
-        self._generators = generators
-        self._unkept: Latent | None = given
-        self._shape = given.shape[2:]
-
-    def advance(self, conditioning: Conditioning) -> Latent:
-        """Sample the next latent frame; see `LatentStream.advance`."""
-        assert self._unkept is not None
-        done = self._unkept.shape[1]
-        alone = conditioning.frames(done, done + 1)
-
-        def extend(noisy: Latent, sigma: Sigmas, actions: Conditioning) -> Latent:
-            inputs = self._objective.sampling_inputs(sigma, self._steps)
-            return self._model.extend(noisy, sigma, actions, self._cache, **inputs)
-
-        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
-            if self._unkept is None:
-                return extend(noisy, sigma, alone)
-            pair = torch.cat([self._unkept, noisy], 1)
-            predicted = extend(pair, functional.pad(sigma, (done, 0)), conditioning)
-            self._cache.keep(done)
-            self._unkept = None
-            return predicted[:, done:]
-
-        noise = drawn_noise((1, *self._shape), self._generators).to(self._unkept)
-        self._unkept = self._objective.sample(evaluate, noise, noise[:, :0], self._steps)
-        return self._unkept
+    streams_as = _Stream

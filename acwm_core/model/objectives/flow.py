@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError, check_shape
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import Denoiser
+from acwm_core.model.dynamics import Denoiser, LatentStream
 from acwm_core.model.objectives.objective import Batch, Objective, drawn_noise
 from acwm_core.model.shapes import Latent, Sigmas
 
@@ -52,6 +52,31 @@ def gaussian_weights(sigma: Tensor) -> Tensor:
     return weights / weights.mean()
 
 
+FlowT = TypeVar("FlowT", bound="FlowMatching")
+
+
+class FlowStream(LatentStream, Generic[FlowT]):
+    """A running prediction of a denoiser, which caches what it computed for earlier frames."""
+
+    def __init__(
+        self,
+        objective: FlowT,
+        model: Denoiser,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        steps: int | None,
+        context: int,
+    ) -> None:
+        self.objective, self.steps = objective, steps
+        self.model, self.cache = model, model.new_cache(context)
+        self.generators = generators
+        self.last = given  # the given frames, and later the last one
+
+    def noise(self) -> Latent:
+        """Standard normal noise for the next latent frame, `[B, 1, C, h, w]`."""
+        return drawn_noise((1, *self.last.shape[2:]), self.generators).to(self.last)
+
+
 class FlowMatching(Objective[Denoiser]):
     """What all objectives of flow matching share: the path, its schedule, the loss, the sampler.
 
@@ -68,11 +93,15 @@ class FlowMatching(Objective[Denoiser]):
         steps: network evaluations when sampling. The published sampler has a schedule of 50 points
             and so 49 evaluations.
 
+    Attributes:
+        streams_as: how it samples frame by frame; None if it cannot.
+
     Raises:
         RecipeError: a value is out of its range.
     """
 
     trains = Denoiser
+    streams_as: type[FlowStream[Any]] | None = None
 
     def __init__(
         self,
@@ -113,6 +142,20 @@ class FlowMatching(Objective[Denoiser]):
             return evaluation(model, given.conditioning, **inputs)(noisy, sigma)
 
         return self.sample(evaluate, given.noise(frames), given.latents, steps)
+
+    def stream(
+        self,
+        model: Denoiser,
+        given: Latent,
+        generators: Sequence[torch.Generator],
+        *,
+        steps: int | None = None,
+        context: int,
+    ) -> LatentStream:
+        """Sample frame by frame as `streams_as` does; see `Objective.stream`."""
+        if self.streams_as is None:
+            return super().stream(model, given, generators, steps=steps, context=context)
+        return self.streams_as(self, model, given, generators, steps, context)
 
     def sampling_inputs(self, sigma: Sigmas, steps: int | None) -> dict[str, Tensor]:
         """The further inputs of an evaluation in `steps` sampling steps, at levels `[B, L]`."""

@@ -9,7 +9,7 @@ frame by frame, with the same inputs as training.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,10 +17,43 @@ from torch import Tensor
 
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import Cache, Denoiser, InputKind, LatentStream
-from acwm_core.model.objectives.flow import Evaluate, FlowMatching, evaluation, mix
-from acwm_core.model.objectives.objective import Batch, drawn_noise
+from acwm_core.model.dynamics import Denoiser, InputKind
+from acwm_core.model.objectives.flow import Evaluate, FlowMatching, FlowStream, evaluation, mix
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.shapes import Latent, Sigmas
+
+
+class _Stream(FlowStream["NextFrame"]):
+    """Samples latent frames one after the other; each gets the previous frame as input.
+
+    In the cache, later frames see a frame as it was evaluated last, still noisy, as in training.
+    Its final latent is an input of the frame after it.
+    """
+
+    def advance(self, conditioning: Conditioning) -> Latent:
+        """Sample the next latent frame; see `LatentStream.advance`."""
+        done, last = self.last.shape[1], self.last[:, -1:]
+        if not self.cache.frames:
+            given, clean = self.last, self.last.new_zeros(self.last.shape[:2])
+            self._extend(given, clean, conditioning.frames(0, done), frames_before(given))
+            self.cache.keep(done)
+        own = conditioning.frames(done, done + 1)
+
+        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
+            return self._extend(noisy, sigma, own, last)
+
+        noise = self.noise()
+        after = self.objective.from_change(evaluate, last)
+        self.last = self.objective.sample(after, noise, noise[:, :0], self.steps)
+        self.cache.keep(1)
+        return self.last
+
+    def _extend(
+        self, noisy: Latent, sigma: Sigmas, conditioning: Conditioning, previous: Latent
+    ) -> Latent:
+        clean = previous.new_zeros(previous.shape[:2])
+        past = {"previous": previous, "previous_sigma": clean}
+        return self.model.extend(noisy, sigma, conditioning, self.cache, **past)
 
 
 class NextFrame(FlowMatching):
@@ -41,6 +74,7 @@ class NextFrame(FlowMatching):
     """
 
     causal = True
+    streams_as = _Stream
     inputs: Mapping[str, InputKind] = {"previous": "latent", "previous_sigma": "level"}
 
     def __init__(self, *, past_noise: float = 0.3, own_past: float = 0.0, **flow: Any) -> None:
@@ -91,18 +125,6 @@ class NextFrame(FlowMatching):
             clip.append(stream.advance(given.conditioning.frames(start, frame + 1)))
         return torch.cat(clip, 1)
 
-    def stream(
-        self,
-        model: Denoiser,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        *,
-        steps: int | None = None,
-        context: int,
-    ) -> LatentStream:
-        """Sample frame by frame with a cache; see `Objective.stream`."""
-        return _NextFrameStream(self, model, given, generators, steps, model.new_cache(context))
-
     def streams_by_default(self, model: Denoiser) -> bool:
         """Always: a stream has the inputs of training."""
         return True
@@ -112,53 +134,6 @@ class NextFrame(FlowMatching):
         if self.prediction == "velocity":
             return evaluate
         return lambda noisy, sigma: previous + evaluate(noisy, sigma)
-
-
-class _NextFrameStream(LatentStream):
-    """Samples latent frames one after the other; each gets the previous frame as input.
-
-    In the cache, later frames see a frame as it was evaluated last, still noisy, as in training.
-    Its final latent is an input of the frame after it.
-    """
-
-    def __init__(
-        self,
-        objective: NextFrame,
-        model: Denoiser,
-        given: Latent,
-        generators: Sequence[torch.Generator],
-        steps: int | None,
-        cache: Cache,
-    ) -> None:
-        self._objective, self._steps = objective, steps
-        self._model, self._cache = model, cache
-        self._generators = generators
-        self._last = given
-
-    def advance(self, conditioning: Conditioning) -> Latent:
-        """Sample the next latent frame; see `LatentStream.advance`."""
-        done, last = self._last.shape[1], self._last[:, -1:]
-        if not self._cache.frames:
-            given, clean = self._last, self._last.new_zeros(self._last.shape[:2])
-            self._extend(given, clean, conditioning.frames(0, done), frames_before(given))
-            self._cache.keep(done)
-        own = conditioning.frames(done, done + 1)
-
-        def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
-            return self._extend(noisy, sigma, own, last)
-
-        noise = drawn_noise(last.shape[1:], self._generators).to(last)
-        after = self._objective.from_change(evaluate, last)
-        self._last = self._objective.sample(after, noise, noise[:, :0], self._steps)
-        self._cache.keep(1)
-        return self._last
-
-    def _extend(
-        self, noisy: Latent, sigma: Sigmas, conditioning: Conditioning, previous: Latent
-    ) -> Latent:
-        clean = previous.new_zeros(previous.shape[:2])
-        past = {"previous": previous, "previous_sigma": clean}
-        return self._model.extend(noisy, sigma, conditioning, self._cache, **past)
 
 
 def frames_before(latents: Latent) -> Latent:
