@@ -172,7 +172,8 @@ def save(
     """
     from acwm_core.errors import TrainingError
     from acwm_core.files import written_whole
-    from acwm_core.training.run import RunFolder, save_weights  # imports torch
+    from acwm_core.training.run import save_weights  # imports torch
+    from acwm_core.training.run_folder import RunFolder
 
     run = RunFolder(path)
     if run.recipe.exists():

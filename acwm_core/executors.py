@@ -36,43 +36,64 @@ POLL = 0.2  # seconds between checks of the workers' progress
 
 
 @contextlib.contextmanager
-def progress_bar(what: str, total: int, *, done: int = 0, shown: bool = True) -> Generator[Report]:
+def progress_bar(
+    what: str,
+    total: int | None,
+    *,
+    unit: str = "episodes",
+    done: int = 0,
+    shown: bool = True,
+    note: Callable[[], str] = str,
+) -> Generator[Report]:
     """Show a progress bar with rate and remaining time; without a terminal, print occasional lines.
 
     Args:
         what: label of the bar, e.g. what is being made.
-        total: total number of episodes.
-        done: number of episodes finished by earlier runs.
+        total: total number of units, if it is known.
+        unit: what is counted.
+        done: number of units finished by earlier runs.
         shown: whether to show it.
+        note: what to show beside the rate; it is asked for as often as that is shown.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
-    rate = TextColumn("episodes {task.fields[rate]}")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate)
+    console = Console(stderr=True)
+    shown = shown and done != total
+    text = TextColumn(f"{unit} {{task.fields[text]}}")
     with Progress(
-        *columns,
-        Remaining(),
-        console=Console(stderr=True),
-        disable=not shown or done == total,
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), text, Remaining()),
+        console=console,
+        disable=not shown or not console.is_terminal,
         speed_estimate_period=600,  # seconds, for several episodes even if they are slow
     ) as bar:
-        task = bar.add_task(what, total=total, completed=done, rate="")
+        task = bar.add_task(what, total=total, completed=done, text="")
         line_at = time.monotonic() + LINE_EVERY_S
 
-        def report(episodes: int) -> None:
-            nonlocal line_at
-            bar.advance(task, episodes)
+        def text_now() -> str:
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed or 0
-            told = f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min" if speed else ""
-            bar.update(task, rate=told)
-            if not bar.disable and not bar.console.is_terminal and time.monotonic() >= line_at:
+            rate = f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min" if speed else ""
+            return "  ".join(filter(None, (rate, note())))
+
+        def print_line() -> None:
+            made = int(bar.tasks[0].completed)
+            of = made if total is None else f"{made}/{total}"
+            line = f"{what}  {of} {unit}  {text_now()}"
+            console.print(line.rstrip(), highlight=False, soft_wrap=True)
+
+        def report(units: int) -> None:
+            nonlocal line_at
+            bar.advance(task, units)
+            if not bar.disable:
+                bar.update(task, text=text_now())
+            elif shown and time.monotonic() >= line_at:
                 line_at = time.monotonic() + LINE_EVERY_S
-                made = int(bar.tasks[0].completed)
-                bar.console.print(f"{what}  {made}/{total} episodes  {told}", highlight=False)
+                print_line()
 
         yield report
+        if shown and bar.disable:
+            print_line()
 
 
 class Executor(ABC):

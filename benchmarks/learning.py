@@ -31,7 +31,8 @@ from rich.console import Console
 from rich.table import Table
 
 from acwm_core.evaluation.results import Summary
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import read_metadata
+from acwm_core.training.run_folder import RunFolder
 
 RECIPES = ("push_cube", "reacher", "robot_arm", "push_rope", "pour_water", "push_sand")
 SIZES = {"push_sand": "64x112"}

@@ -20,7 +20,8 @@ from PIL import Image
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
-from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_core.training.run import load_run, read_metadata
+from acwm_core.training.run_folder import RunFolder
 from acwm_formats.preview import Picture, below, beside, magnified
 from acwm_zoo.shipped import folder, shipped
 

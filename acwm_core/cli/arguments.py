@@ -63,13 +63,13 @@ class Run(ExistingFolder):
 
     def names(self) -> list[str]:
         """The names of trained models."""
-        from acwm_core.training.trained import trained_models
+        from acwm_core.training.run_folder import trained_models
 
         return trained_models()
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The path of the folder."""
-        from acwm_core.training.trained import run_to_write
+        from acwm_core.training.run_folder import run_to_write
 
         return super().convert(run_to_write(value), param, ctx)
 

@@ -40,8 +40,8 @@ from acwm_core.evaluation.summarise import gap, summarise_split
 from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip, magnification
 from acwm_core.files import held, writing, written_whole
 from acwm_core.recipe import Recipe, compose
-from acwm_core.training.run import RunFolder, load_run
-from acwm_core.training.trained import run_to_write
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder, run_to_write
 
 
 def evaluate_run(

@@ -16,7 +16,8 @@ from acwm_core.data.shards import file_sha256
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.score import measure_facts
 from acwm_core.recipe import Recipe
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import read_metadata
+from acwm_core.training.run_folder import RunFolder
 
 
 def provenance(

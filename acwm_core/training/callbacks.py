@@ -24,7 +24,8 @@ from acwm_core.files import written_whole
 from acwm_core.model.shapes import Video
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import gradient_norm, total_norm
-from acwm_core.training.run import RunFolder, save_weights
+from acwm_core.training.run import save_weights
+from acwm_core.training.run_folder import RunFolder
 
 MAX_ROLLOUT_STEPS = 4
 """Most sampling steps in validation rollouts, which only show a trend and must be cheap."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.callbacks import Callback
 from torch.distributed import DistBackendError
 
@@ -30,11 +28,17 @@ from acwm_core.training.data import ClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.progress import StepProgress
-from acwm_core.training.resume import AUTO, checkpoint_to_resume, claimed, is_first_process
-from acwm_core.training.run import RunFolder, all_training, load_weights
+from acwm_core.training.resume import (
+    AUTO,
+    checkpoint_to_resume,
+    claimed,
+    described,
+    is_first_process,
+)
+from acwm_core.training.run import all_training, load_weights
+from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
-from acwm_core.training.threads import idle_cores
-from acwm_core.training.trained import find_run
+from acwm_core.training.threads import use_threads
 from acwm_core.training.trainer import build_trainer
 
 
@@ -63,7 +67,7 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     """
     silence_irrelevant_warnings()
     run = RunFolder(run_dir if resume in (None, AUTO) else resume)
-    with _quiet_after_the_first():
+    with _quiet_after_the_first(), claimed(run):
         episodes = EpisodeDataset(recipe.data["path"], "train")
         _check_environment(recipe, episodes.card)
         checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
@@ -97,11 +101,13 @@ def _train(
         [preemption, callbacks.CpuTime(start), *_callbacks(run, config, data)],
         build_loggers(run, recipe.trainer, step),
     )
-    threads = _use_threads(config, trainer, run if checkpoint else None)
+    on_one_cpu = trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1
+    before = Recipe.from_yaml(run.recipe).training.get("cpu_threads") if checkpoint else None
+    threads = use_threads(config.cpu_threads, before, choose=on_one_cpu and not checkpoint)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with (
         _explained(trainer, run, preemption),
-        claimed(run, recipe, episodes.card, checkpoint, step, module),
+        described(run, recipe, episodes.card, checkpoint is None, module),
         preemption.watching(trainer),
     ):
         for logger in trainer.loggers:
@@ -143,29 +149,6 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
     if rollouts and len(video):
         chosen.append(callbacks.ValidationRollouts(video[:rollouts], actions[:rollouts]))
     return chosen
-
-
-def _use_threads(
-    config: TrainingConfig, trainer: L.Trainer, resumed: RunFolder | None
-) -> int | None:
-    """Set the number of CPU threads and return it, or None if PyTorch's default is used.
-
-    That of the recipe, else of the run that is resumed, for bitwise equal results. Else, if one
-    process trains on a CPU, PyTorch's default, but no more than there are idle cores if waiting
-    threads spin: two that spin on two busy cores train 6 times as slowly as one, two that sleep
-    1.1 times.
-    """
-    is_free = "OMP_NUM_THREADS" not in os.environ
-    threads = config.cpu_threads
-    if threads is None and resumed is not None:
-        threads = Recipe.from_yaml(resumed.recipe).training.get("cpu_threads")
-    elif threads is None and trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1:
-        threads = torch.get_num_threads()
-        if is_free and os.environ.get("OMP_WAIT_POLICY", "").upper() != "PASSIVE":
-            threads = min(threads, max(1, round(idle_cores())))
-    if threads and (is_free or config.cpu_threads):
-        torch.set_num_threads(threads)
-    return threads
 
 
 def _check_environment(recipe: Recipe, card: DatasetCard) -> None:

@@ -20,7 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from acwm_core.errors import MissingExtraError
 from acwm_core.files import disk_error, written_whole
 from acwm_core.training.config import LOGGERS, chosen_loggers
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 
 IRRELEVANT = (
     r".*does not have many workers.*",  # decoding is cheap or cached; data.workers sets the number
@@ -133,17 +133,17 @@ class MetricsFile(Logger):
 
     def _add_columns(self, row: Iterable[str]) -> None:
         """Write the file again, row by row, with columns for all of `row`."""
-        is_resumed = not self._columns and self._first_step > 0 and self._path.exists()
-        old = self._path if self._columns or is_resumed else Path(os.devnull)
+        is_first = not self._columns  # what is there is of an earlier process
+        old = self._path if self._path.exists() else Path(os.devnull)
         with old.open(newline="") as before, written_whole(self._path) as partial:
             rows = csv.DictReader(before)
             self._columns = [*dict.fromkeys([*(rows.fieldnames or ()), *row])]
             with partial.open("w", newline="") as after:
                 writer = csv.DictWriter(after, self._columns, restval="")
                 writer.writeheader()
-                writer.writerows(each for each in rows if not is_resumed or self._is_before(each))
+                writer.writerows(each for each in rows if not is_first or self._is_before(each))
 
-    def _is_before(self, row: Mapping[str, str | None]) -> bool:
-        """Whether a row is complete, and of a step before the first one."""
-        step = row["step"] or ""
+    def _is_before(self, row: Mapping[str, str]) -> bool:
+        """Whether a row has its step, and it is one before the first."""
+        step = row.get("step", "")
         return step.isdecimal() and int(step) < self._first_step

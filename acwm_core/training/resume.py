@@ -1,8 +1,9 @@
-"""Which checkpoint a training resumes from, and the lock on its run folder."""
+"""The lock on the run folder of a training, and the checkpoint from which it resumes."""
 
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any, cast
@@ -12,10 +13,11 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import TrainingError
-from acwm_core.files import check_inside, held, written_whole
+from acwm_core.files import held, written_whole
 from acwm_core.recipe import Recipe, recipe_differences
-from acwm_core.training.checkpoints import check_sums, last_whole, read_details
-from acwm_core.training.run import OWN, RunFolder, read_metadata
+from acwm_core.training.checkpoints import check_sums, last_whole
+from acwm_core.training.run import read_metadata
+from acwm_core.training.run_folder import RunFolder
 from acwm_core.training.signals import StoppedEarly
 
 AUTO = "auto"
@@ -27,15 +29,31 @@ def is_first_process() -> bool:
     return cast(Any, rank_zero_only).rank == 0
 
 
+@contextlib.contextmanager
+def claimed(run: RunFolder) -> Generator[None]:
+    """Lock the run folder while the first process trains; remove a new one that got no recipe."""
+    if not is_first_process():
+        yield
+        return
+    is_new = not run.path.exists()
+    run.path.mkdir(parents=True, exist_ok=True)
+    try:
+        with held(run.path):
+            yield
+    finally:
+        if is_new and not run.recipe.exists():
+            shutil.rmtree(run.path, ignore_errors=True)
+
+
 def checkpoint_to_resume(
     run: RunFolder, recipe: Recipe, card: DatasetCard, resume: Path | str | None
 ) -> Path | None:
     """The checkpoint to resume from, or None to start.
 
     The first process refuses a folder that holds another run, or a run that this recipe and data
-    cannot resume; the folder is in use by the time Lightning starts the others.
+    cannot resume.
     """
-    check_inside(run.path, *OWN)
+    run.check_links()
     last = last_whole(run.last_checkpoint)
     if not is_first_process():
         return None if resume is None else last
@@ -48,16 +66,9 @@ def checkpoint_to_resume(
         if last or resume not in (None, AUTO):
             raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
         return None
-    with held(run.path):  # fails if another command is training it: its files may be incomplete
-        pass
     if resume is None:
-        raise TrainingError(
-            f"{run.path} holds a run already: continue it by resume={run.path}, or choose another "
-            "folder"
-            if last
-            else f"{run.path} holds a run without a checkpoint: if it is not running, remove the "
-            "folder; or choose another"
-        )
+        way = f"continue it by resume={run.path}" if last else "it has no checkpoint: remove it"
+        raise TrainingError(f"{run.path} holds a run already: {way}, or choose another folder")
     differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
     differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
     if differences:
@@ -76,15 +87,10 @@ def checkpoint_to_resume(
 
 
 @contextlib.contextmanager
-def claimed(
-    run: RunFolder,
-    recipe: Recipe,
-    card: DatasetCard,
-    checkpoint: Path | None,
-    first_step: int,
-    module: L.LightningModule,
+def described(
+    run: RunFolder, recipe: Recipe, card: DatasetCard, is_new: bool, module: L.LightningModule
 ) -> Generator[None]:
-    """Lock the run folder and write recipe and card into it, while the first process trains.
+    """Write recipe and card into the run folder, if this is the first process.
 
     If a new run fails before its first step, both are removed, so that it can be fixed and started
     again in the same folder.
@@ -92,21 +98,14 @@ def claimed(
     if not is_first_process():
         yield
         return
-    run.checkpoints.mkdir(parents=True, exist_ok=True)
-    with held(run.path):
-        last = last_whole(run.last_checkpoint)
-        if last != checkpoint or (last and read_details(last)["global_step"] != first_step):
-            raise TrainingError(
-                f"another command has trained {run.path} meanwhile: continue with resume={run.path}"
-            )
-        with written_whole(run.recipe) as partial:
-            partial.write_text(recipe.to_yaml(), encoding="utf-8")
-        card.write(run.path)
-        try:
-            yield
-        except Exception as error:
-            is_new = checkpoint is None and module.global_step == 0
-            if is_new and not isinstance(error, (StoppedEarly, OSError)):
-                run.recipe.unlink(missing_ok=True)
-                run.card.unlink(missing_ok=True)
-            raise
+    run.checkpoints.mkdir(exist_ok=True)
+    with written_whole(run.recipe) as partial:
+        partial.write_text(recipe.to_yaml(), encoding="utf-8")
+    card.write(run.path)
+    try:
+        yield
+    except Exception as error:
+        if is_new and module.global_step == 0 and not isinstance(error, (StoppedEarly, OSError)):
+            run.recipe.unlink(missing_ok=True)
+            run.card.unlink(missing_ok=True)
+        raise

@@ -1,4 +1,4 @@
-"""Run folders: the files of a training run, and how to load them (without lightning)."""
+"""The model of a run: its weights, and how much training is behind them. Without lightning."""
 
 from __future__ import annotations
 
@@ -16,55 +16,19 @@ from torch import Tensor
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
-from acwm_core.files import check_inside, written_whole
+from acwm_core.files import written_whole
 from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import COMPONENTS
-from acwm_core.training.trained import find_run, trained_models
+from acwm_core.training.run_folder import RunFolder, find_run, trained_models
 
 FORMAT = 1
 """Version of the metadata of `model.safetensors`."""
 
 TRAINED = ("model.", "conditioner.")
 """Prefixes of a world model's weights that training changes and a run saves."""
-
-
-OWN = (
-    *("recipe.yaml", "card.yaml", "*.safetensors", "metrics.csv", "README.md"),
-    *(
-        f"{folder}{rest}"
-        for folder in ("checkpoints", "samples", "evaluation", "planning")
-        for rest in ("", "/**/*")
-    ),
-)
-"""Patterns of acwm's own files in a run folder; loggers such as wandb write others."""
-
-
-class RunFolder:
-    """The paths of one run.
-
-    Attributes:
-        path: the folder, e.g. ``runs/push_cube``.
-        recipe: the fully expanded recipe; a folder that contains it holds a run.
-        card: a copy of the dataset's card.
-        checkpoints: folder of Lightning's checkpoints, `last.ckpt` and `best.ckpt`.
-        last_checkpoint: the checkpoint from which a run resumes.
-        weights: the averaged weights of model and conditioner, for prediction.
-        metrics: logged metrics by step, as CSV.
-        samples: sample videos made during training.
-    """
-
-    def __init__(self, path: Path | str) -> None:
-        self.path = path = Path(path)
-        self.recipe = path / "recipe.yaml"
-        self.card = path / "card.yaml"
-        self.checkpoints = path / "checkpoints"
-        self.last_checkpoint = self.checkpoints / "last.ckpt"
-        self.weights = path / "model.safetensors"
-        self.metrics = path / "metrics.csv"
-        self.samples = path / "samples"
 
 
 class RunBundle(NamedTuple):
@@ -93,7 +57,7 @@ def load_run(path: Path | str) -> RunBundle:
             f"{folder.path} has no trained weights yet: its training stopped before the first "
             "checkpoint"
         )
-    check_inside(folder.path, *OWN)
+    folder.check_links()
     recipe = compose(folder.recipe, sections=COMPONENTS)
     card = DatasetCard.read(folder.card).environment
     world_model = build_world_model(recipe, card)

@@ -24,7 +24,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.training.callbacks import stepped
 from acwm_core.training.checkpoints import last_whole
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 """Ctrl-C, the usual request to end, and what ``#SBATCH --signal=USR1@120`` sends before the time

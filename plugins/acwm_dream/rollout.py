@@ -34,8 +34,8 @@ from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
 from acwm_core.model.world_model import Mode
 from acwm_core.plugins import catalog
-from acwm_core.training.run import RunFolder, load_run
-from acwm_core.training.trained import find_run
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder, find_run
 
 SQUEEZED = 0.02
 """A picture whose sides have another ratio than the frames, by so much, is not used silently."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.errors import AcwmError, RecipeError, suggest
 from acwm_core.plugins import catalog
-from acwm_core.training.trained import copy_of, find_run, trained_models
+from acwm_core.training.run_folder import copy_of, find_run, trained_models
 from acwm_experiment.files import TaskChoice, slug
 from acwm_experiment.runs import RunSpec
 from acwm_experiment.table import Experiment

@@ -15,8 +15,8 @@ from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
-from acwm_core.training.run import RunBundle, RunFolder, load_run, read_metadata
-from acwm_core.training.trained import find_run
+from acwm_core.training.run import RunBundle, load_run, read_metadata
+from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.controllers import (
     Controller,
     NoSolutionError,

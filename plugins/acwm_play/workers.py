@@ -15,7 +15,7 @@ from acwm_core.env.task import Task
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
-from acwm_core.training.trained import find_run
+from acwm_core.training.run_folder import find_run
 from acwm_planning.planner import Driver
 from acwm_planning.run import usual_actions
 from acwm_play.live_model import LiveModel

@@ -13,8 +13,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.env.task import Task
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.plugins import catalog
-from acwm_core.training.run import RunFolder
-from acwm_core.training.trained import find_run, trained_models
+from acwm_core.training.run_folder import RunFolder, find_run, trained_models
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.results import SetSummary, write_json
 from acwm_core.evaluation.storage import refuse_other_result
 from acwm_core.evaluation.summarise import summarise
-from acwm_core.training.run import RunFolder
-from acwm_core.training.trained import run_to_write
+from acwm_core.training.run_folder import RunFolder, run_to_write
 from acwm_severity.curves import (
     SEVERITY,
     SeverityCurve,

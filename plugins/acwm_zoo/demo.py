@@ -72,7 +72,8 @@ def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool
 def _fit(recipe: Recipe, run: Path) -> bool:
     wait_without_spinning()
     from acwm_core.training.fit import fit
-    from acwm_core.training.run import RunFolder, read_metadata
+    from acwm_core.training.run import read_metadata
+    from acwm_core.training.run_folder import RunFolder
 
     folder = RunFolder(run)
     finished = recipe.trainer["max_steps"]
@@ -86,7 +87,7 @@ def _fit(recipe: Recipe, run: Path) -> bool:
 
 def _evaluate(run: Path) -> bool:
     from acwm_core.evaluation.evaluate import evaluate_run
-    from acwm_core.training.run import RunFolder
+    from acwm_core.training.run_folder import RunFolder
 
     if _is_newer(run, RunFolder(run).weights):
         return False
@@ -97,7 +98,8 @@ def _evaluate(run: Path) -> bool:
 def _evaluate_shipped(run: Path, out: Path) -> bool:
     """Evaluate the shipped model of this world on the same clips."""
     from acwm_core.evaluation.evaluate import evaluate_run
-    from acwm_core.training.run import RunFolder, load_run
+    from acwm_core.training.run import load_run
+    from acwm_core.training.run_folder import RunFolder
 
     if _is_newer(out, RunFolder(run).weights):
         return False

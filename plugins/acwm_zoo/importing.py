@@ -21,7 +21,8 @@ from acwm_core.files import load_plain, written_whole
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import with_overrides
-from acwm_core.training.run import RunFolder, save_weights
+from acwm_core.training.run import save_weights
+from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.importer import CheckpointImporter, ForeignModel, convert, recipe_of
 
 CODEC = "codec.safetensors"

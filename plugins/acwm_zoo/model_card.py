@@ -13,7 +13,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import Estimate, Summary
 from acwm_core.recipe import Recipe
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import read_metadata
+from acwm_core.training.run_folder import RunFolder
 
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
 

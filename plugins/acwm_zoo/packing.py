@@ -18,7 +18,8 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import EPISODES
 from acwm_core.files import made_whole, writing
 from acwm_core.recipe import Recipe
-from acwm_core.training.run import RunFolder, load_run, read_metadata, save_weights, training_of
+from acwm_core.training.run import load_run, read_metadata, save_weights, training_of
+from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.model_card import model_card
 from acwm_zoo.shipped import MODEL_CARD
 

@@ -53,16 +53,16 @@ def test_a_foreign_executor_generates(tmp_path, monkeypatch):
 
 
 def test_without_a_terminal_progress_is_told_in_lines(monkeypatch, capsys):
-    """By a clock that goes on by four seconds per episode, in lines every ten."""
+    """By a clock that goes on by four seconds per episode, in lines every ten, and at the end."""
     now = [0]
     monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with executors.progress_bar("encoding train", 8, done=1) as report:
-        for _ in range(7):
+    with executors.progress_bar("encoding train", 9, done=1, note=lambda: "loss 2") as report:
+        for _ in range(8):
             now[0] += 4
             report(1)
     said = capsys.readouterr().err.splitlines()
-    lines = [line.partition("episodes")[0] for line in said if line.startswith("encoding train  ")]
-    assert lines == ["encoding train  4/8 ", "encoding train  7/8 "]
+    assert [line.split()[2] for line in said] == ["4/9", "7/9", "9/9"]
+    assert said[0].endswith("  loss 2")
     with executors.progress_bar("hidden", 2, shown=False) as report:
         report(2)
     assert capsys.readouterr().err == ""

@@ -13,7 +13,7 @@ from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
 from acwm_core.evaluation.references import KEPT, package_hash, references_file
 from acwm_core.evaluation.results import Summary
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests import tiny
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from acwm_core.recipe.compose import recipe_folder
-from acwm_core.training.trained import trained_models
+from acwm_core.training.run_folder import trained_models
 from acwm_experiment.files import read_experiment
 from acwm_experiment.plan import make_plan
 from tests.recipe.test_shipped import COMPARED, PAPER

@@ -2,7 +2,10 @@ import pytest
 import torch
 
 from acwm_core.data.generate import generate
+from acwm_core.training.fit import fit
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import register
+from tests.training.runs import killable
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -17,6 +20,12 @@ def data(tmp_path_factory, tiny_parts):
     folder = tmp_path_factory.mktemp("data") / "tiny_world"
     generate("tiny_world", folder, episodes={"train": 8}, workers=0, progress=False)
     return folder
+
+
+@pytest.fixture(scope="session")
+def whole(data, tmp_path_factory):
+    """One run that nobody interrupted."""
+    return RunFolder(fit(killable(data), tmp_path_factory.mktemp("runs") / "whole"))
 
 
 @pytest.fixture(autouse=True)

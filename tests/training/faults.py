@@ -2,7 +2,9 @@
 
 import multiprocessing
 import os
+import re
 import shutil
+import signal
 from pathlib import Path
 
 import torch
@@ -33,7 +35,9 @@ class CutLatents(Callback):
 
 
 class KillWorker(Callback):
-    """Kills the processes that read data, before a batch."""
+    """Kills the processes that read data, before a batch; notes whether they had blocked Ctrl-C."""
+
+    blocked: bool | None = None
 
     def __init__(self, batch: int) -> None:
         self.batch = batch
@@ -41,6 +45,9 @@ class KillWorker(Callback):
     def on_train_batch_start(self, trainer, *_):
         if trainer.fit_loop.total_batch_idx == self.batch and not os.environ.get("SPARED"):
             for process in multiprocessing.active_children():
+                status = Path(f"/proc/{process.pid}/status").read_text()
+                mask = int(re.search("SigBlk:\\s*(\\w+)", status)[1], 16)
+                KillWorker.blocked = bool(mask >> signal.SIGINT - 1 & 1)
                 process.kill()
                 process.join()
 

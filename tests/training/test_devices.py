@@ -13,10 +13,11 @@ import torch
 from acwm_core.errors import TrainingError
 from acwm_core.training.checkpoints import read_whole
 from acwm_core.training.fit import fit
-from acwm_core.training.memory import state_memory
-from acwm_core.training.run import RunFolder, load_run, read_metadata
+from acwm_core.training.layers import state_memory
+from acwm_core.training.run import load_run, read_metadata
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe
-from tests.training.test_fit import numbers
+from tests.training.runs import numbers
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,9 +9,10 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import RecipeError
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import TinyModel, tiny_recipe
-from tests.training.test_fit import numbers
+from tests.training.runs import numbers
 from tests.training.test_short_episodes import short  # noqa: F401 - a fixture
 
 STEPS = {"max_steps": 4}
@@ -82,9 +83,14 @@ def test_short_clips_keep_a_frame_to_predict(short, seen, tmp_path, cached):  # 
 
 
 @pytest.mark.parametrize(
-    "reading", [{}, {"cache_latents": False}, {"reader": "webdataset", "shuffle_buffer": 1}]
+    ("frames", "starts", "reading"),
+    [
+        (5, (0, 4), {}),
+        (9, (0,), {"cache_latents": False}),
+        (12, (0,), {}),
+        (5, (0, 4), {"reader": "webdataset", "shuffle_buffer": 1}),
+    ],
 )
-@pytest.mark.parametrize(("frames", "starts"), [(5, (0, 4)), (9, (0,)), (12, (0,))])
 def test_clips_may_begin_with_their_episodes_and_follow_each_other(
     data, tmp_path, frames, starts, reading
 ):

@@ -7,10 +7,11 @@ import torch
 
 from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe
 from tests.training.callbacks import Kill
-from tests.training.test_fit import assert_same, killable, killed_run
+from tests.training.runs import assert_same, killable, killed_run
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from torch import nn
 from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.layers import layers_of, recompute_activations
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe
-from tests.training.test_fit import weights
+from tests.training.runs import weights
 
 DEEP = {"model": {"depth": 2}, "trainer": {"max_steps": 6, "precision": "32-true"}}
 

@@ -15,10 +15,9 @@ from acwm_core.errors import DataError, TrainingError
 from acwm_core.renamed import RenamedWarning
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import TinyCodec, tiny_recipe
-from tests.training.callbacks import Kill, Killed
-from tests.training.test_fit import assert_same
+from tests.training.runs import assert_same
 from tests.training.test_processes import TWO, train
 
 VIDEO = {"cache_latents": False}
@@ -76,23 +75,6 @@ def test_skip_damaged_is_told_to_be_gone(shards):
     assert recipe == tiny_recipe(shards, data={"skip_damaged": False})
 
 
-def test_a_run_that_damage_ended_goes_on_when_it_is_mended(shards, tmp_path, monkeypatch):
-    recipe = {"trainer": {"callbacks": [{"class_path": "tests.training.callbacks.Kill"}]}}
-    whole = RunFolder(fit(tiny_recipe(shards, data=VIDEO, **recipe), tmp_path / "whole"))
-    run = tmp_path / "run"
-    monkeypatch.setattr(Kill, "batch", 10)
-    with pytest.raises(Killed):
-        fit(tiny_recipe(shards, data=VIDEO, **recipe), run)
-    monkeypatch.setattr(Kill, "batch", None)
-    sound = shutil.copytree(shards, tmp_path / "sound")
-    damage(shards)
-    with pytest.raises(DataError, match=r"shard-00001\.tar is damaged"):
-        fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
-    shutil.copytree(sound, shards, dirs_exist_ok=True)
-    fit(tiny_recipe(shards, data=VIDEO, **recipe), "", resume=run)
-    assert_same(whole, RunFolder(run))
-
-
 def test_steps_of_another_size_are_refused(shards):
     """They would go on with the very next clip, but not on the same loss curve."""
     config = DataConfig(str(shards), clip_frames=9, batch_size=4)
@@ -136,11 +118,3 @@ def test_a_fraction_of_the_data_leaves_validation_alone(shards, fraction):
     assert len(training) == 6 * fraction
     assert training <= set(range(6))
     assert {*data._validation.windows[:, 0].tolist()} == {6, 7}
-
-
-def test_a_fraction_trains_otherwise_and_resumes_only_as_it_was(shards, tmp_path):
-    halved = tiny_recipe(shards, data={"fraction": 0.5}, trainer={"max_steps": 4})
-    run = fit(halved, tmp_path / "half")
-    whole = tiny_recipe(shards, trainer={"max_steps": 8})
-    with pytest.raises(TrainingError, match=r"data\.fraction was 0\.5, is 1\.0"):
-        fit(whole, tmp_path / "other", resume=run)

@@ -59,7 +59,13 @@ def data_of(tmp_path_factory):
 @pytest.mark.parametrize(
     ("recipe", "words"),
     [
-        *((name, () if name in SMALL else ("+small",)) for name in recipe_names()),
+        *((name, ()) for name in SMALL),
+        ("robot_arm", ("+small",)),
+        *(
+            pytest.param(name, ("+small",), marks=pytest.mark.slow)
+            for name in recipe_names()
+            if name not in (*SMALL, "robot_arm")
+        ),
         ("push_cube_small", ("conditioner=cross_attention",)),
         ("push_cube_small", ("codec=identity",)),
         ("push_cube_small", ("objective=diffusion_forcing",)),

@@ -4,10 +4,10 @@ import pytest
 
 from acwm_core.data import remote
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests.data.serving import served
 from tests.tiny import tiny_recipe
-from tests.training.test_fit import assert_same
+from tests.training.runs import assert_same
 
 
 def test_a_run_on_a_url_is_the_run_on_the_folder(data, tmp_path, monkeypatch):

@@ -5,9 +5,9 @@ import shutil
 import torch
 
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests.training.callbacks import Kill
-from tests.training.test_fit import killable, killed_run
+from tests.training.runs import killable, killed_run
 
 OFTEN = {"validate_every_n_steps": 1, "checkpoint_every_n_steps": 1}
 

@@ -8,24 +8,20 @@ import safetensors.torch
 import torch
 
 from acwm_core.errors import TrainingError
-from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, load_run, load_weights, read_metadata, save_weights
-from tests.tiny import tiny_recipe, tiny_world_model
-
-
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory):
-    return RunFolder(fit(tiny_recipe(data), tmp_path_factory.mktemp("runs") / "run"))
+from acwm_core.training.run import load_run, load_weights, read_metadata, save_weights
+from acwm_core.training.run_folder import RunFolder
+from tests.tiny import tiny_world_model
+from tests.training.runs import killable
 
 
 @pytest.fixture
-def copy(trained, tmp_path):
-    return RunFolder(shutil.copytree(trained.path, tmp_path / "copy"))
+def copy(whole, tmp_path):
+    return RunFolder(shutil.copytree(whole.path, tmp_path / "copy"))
 
 
-def test_loaded_model_is_the_average_of_the_last_step(trained):
-    bundle = load_run(trained.path)
-    saved = torch.load(trained.last_checkpoint, weights_only=True)["state_dict"]
+def test_loaded_model_is_the_average_of_the_last_step(whole):
+    bundle = load_run(whole.path)
+    saved = torch.load(whole.last_checkpoint, weights_only=True)["state_dict"]
     loaded = bundle.world_model.state_dict()
     for name in loaded:
         if not name.startswith("codec."):
@@ -36,7 +32,7 @@ def test_loaded_model_is_the_average_of_the_last_step(trained):
         if not name.startswith("codec.")
     )
     assert bundle.card.name == "tiny_world"
-    assert bundle.recipe.to_dict() == tiny_recipe(bundle.recipe.data["path"]).to_dict()
+    assert bundle.recipe.to_dict() == killable(bundle.recipe.data["path"]).to_dict()
     assert not bundle.world_model.training
 
 
@@ -53,9 +49,9 @@ def test_round_trip_of_weights(tmp_path):
     assert facts == {"format": 1, "step": 7, "codec": there.codec.fingerprint(), "note": "x"}
 
 
-def test_the_codec_is_in_no_file_of_the_run(trained):
-    checkpoint = torch.load(trained.last_checkpoint, weights_only=True)
-    names = [*checkpoint["state_dict"], *safetensors.torch.load_file(trained.weights)]
+def test_the_codec_is_in_no_file_of_the_run(whole):
+    checkpoint = torch.load(whole.last_checkpoint, weights_only=True)
+    names = [*checkpoint["state_dict"], *safetensors.torch.load_file(whole.weights)]
     assert names
     assert not [name for name in names if "codec" in name or "mix" in name]
 

@@ -11,7 +11,7 @@ import torch
 
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
-from acwm_core.training.memory import state_memory
+from acwm_core.training.layers import state_memory
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
 COMMANDS = re.findall(r"(?:acwm|acwm_core\.cli) fit ([^;`\n]+)", TEXT.replace("\\\n", " "))

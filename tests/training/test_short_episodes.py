@@ -8,11 +8,12 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, load_run
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder
 from acwm_formats.arrays import write_dataset
 from tests.recordings import Noise
 from tests.tiny import TinyCodec, TinyModel, tiny_recipe
-from tests.training.test_fit import numbers
+from tests.training.runs import numbers
 
 FRAMES = (9, 5, 12, 7, 6, 9, 8, 5, 9, 6)
 

@@ -8,15 +8,16 @@ import pytest
 
 from acwm_core.errors import TrainingError
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, read_metadata
+from acwm_core.training.run import read_metadata
+from acwm_core.training.run_folder import RunFolder
 from acwm_core.training.signals import SIGNALS, StoppedEarly
 from tests.tiny import tiny_recipe
-from tests.training.test_fit import assert_same, numbers
+from tests.training.runs import assert_same, numbers
 
 
-def signalled(data, /, *, accumulated=1, **init_args):
+def signalled(data, /, *, accumulated=1, max_steps=16, **init_args):
     send = {"class_path": "tests.training.callbacks.Signal", "init_args": init_args}
-    flags = {"callbacks": [send], "accumulate_grad_batches": accumulated}
+    flags = {"callbacks": [send], "accumulate_grad_batches": accumulated, "max_steps": max_steps}
     return tiny_recipe(data, trainer=flags)
 
 
@@ -43,11 +44,6 @@ def slurm(tmp_path, monkeypatch):
     for name, value in {**job, "NODEID": "0", "NNODES": "1", "NTASKS_PER_NODE": "1"}.items():
         monkeypatch.setenv(f"SLURM_{name}", value)
     return told
-
-
-@pytest.fixture(scope="module")
-def whole(data, tmp_path_factory):
-    return RunFolder(fit(tiny_recipe(data), tmp_path_factory.mktemp("runs") / "whole"))
 
 
 @pytest.fixture
@@ -121,23 +117,31 @@ def test_a_validation_is_cut_short(whole, data, tmp_path, again):
     assert numbers(run) == without_validation(whole, 7)
 
 
-def test_a_step_of_several_batches_is_finished(data, tmp_path, again):
-    recipe = signalled(data, accumulated=3, batch=6)
+@pytest.fixture(scope="module")
+def of_three(data, tmp_path_factory):
+    """A run of six steps, each of three batches."""
+    recipe = tiny_recipe(data, trainer={"max_steps": 6, "accumulate_grad_batches": 3})
+    return RunFolder(fit(recipe, tmp_path_factory.mktemp("runs") / "of_three"))
+
+
+def test_a_step_of_several_batches_is_finished(of_three, data, tmp_path, again):
+    recipe = signalled(data, accumulated=3, max_steps=6, batch=6)
     run = RunFolder(tmp_path / "run")
     with pytest.raises(StoppedEarly, match="saved step 3"):
         fit(recipe, run.path)
     again(recipe, run.path)
-    assert_same(RunFolder(again(recipe, tmp_path / "whole")), run)
+    assert_same(of_three, run)
 
 
-def test_a_run_that_is_to_stop_finishes_its_step(data, tmp_path, again):
+def test_a_run_that_is_to_stop_finishes_its_step(of_three, data, tmp_path, again):
     """After the first of three batches of step 5; then it goes on with no clip lost."""
     stop = {"class_path": "tests.training.callbacks.Stop", "init_args": {"batch": 12}}
-    recipe = tiny_recipe(data, trainer={"callbacks": [stop], "accumulate_grad_batches": 3})
+    flags = {"callbacks": [stop], "accumulate_grad_batches": 3, "max_steps": 6}
+    recipe = tiny_recipe(data, trainer=flags)
     run = RunFolder(fit(recipe, tmp_path / "run"))
     assert read_metadata(run.weights)["step"] == 5
     again(recipe, run.path)
-    assert numbers(RunFolder(again(recipe, tmp_path / "whole"))) == without_validation(run, 4)
+    assert numbers(of_three) == without_validation(run, 4)
 
 
 @pytest.mark.parametrize("array", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -182,7 +186,7 @@ def test_a_run_that_never_saved_starts_again(whole, data, tmp_path, again, monke
         ):
             fit(tiny_recipe(data), run.path)
     assert run.recipe.exists()
-    with pytest.raises(TrainingError, match="run without a checkpoint"):
+    with pytest.raises(TrainingError, match="it has no checkpoint"):
         fit(tiny_recipe(data), run.path)
     with pytest.raises(TrainingError, match=r"another recipe: training\.seed was 0, is 5"):
         again(tiny_recipe(data, training={"seed": 5}), run.path)

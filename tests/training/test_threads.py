@@ -9,9 +9,8 @@ import torch
 from acwm_core.recipe import Recipe
 from acwm_core.training import threads
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe
-from tests.training.callbacks import Kill, Killed
 
 
 @pytest.fixture
@@ -20,52 +19,46 @@ def asked(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     calls = []
-    monkeypatch.setattr("acwm_core.training.fit.idle_cores", lambda: calls.append(1) or 0.4)
+    monkeypatch.setattr(threads, "idle_cores", lambda: calls.append(1) or 0.4)
     return calls
 
 
-def recipe_of(data, **training):
-    training = {"cpu_threads": None, **training}
-    trainer = {"max_steps": 6, "callbacks": [{"class_path": "tests.training.callbacks.Kill"}]}
-    return tiny_recipe(data, training=training, trainer=trainer)
-
-
-def recorded(run):
-    return Recipe.from_yaml(RunFolder(run).recipe).training["cpu_threads"]
-
-
 def test_a_run_keeps_the_number_with_which_it_began(data, tmp_path, monkeypatch, asked):
-    monkeypatch.setattr(Kill, "batch", 5)
-    with pytest.raises(Killed):
-        fit(recipe_of(data), tmp_path / "run")
-    assert len(asked) == recorded(tmp_path / "run") == torch.get_num_threads() == 1
-    monkeypatch.setattr(Kill, "batch", 5)
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # it is used, and the record stays
-    with pytest.raises(Killed):
-        fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
-    monkeypatch.setattr(Kill, "batch", None)
-    monkeypatch.delenv("OMP_NUM_THREADS")
+    run = tmp_path / "run"
+
+    def train(steps, resume=None):
+        chosen = {"cpu_threads": None, "schedule": "constant"}
+        fit(tiny_recipe(data, training=chosen, trainer={"max_steps": steps}), run, resume=resume)
+        return Recipe.from_yaml(RunFolder(run).recipe).training["cpu_threads"]
+
+    assert train(2) == torch.get_num_threads() == 1
     torch.set_num_threads(2)
-    fit(recipe_of(data), tmp_path / "run", resume=tmp_path / "run")
-    assert len(asked) == recorded(tmp_path / "run") == torch.get_num_threads() == 1
+    assert train(3, resume=run) == torch.get_num_threads() == 1
+    assert len(asked) == 1
 
 
-def test_threads_that_sleep_are_not_spared(data, tmp_path, monkeypatch, asked):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+@pytest.mark.parametrize(
+    ("variables", "given", "used"),
+    [
+        ({}, {"choose": True}, (1, 1)),  # of the idle cores
+        ({"OMP_WAIT_POLICY": "PASSIVE"}, {"choose": True}, (2, 2)),  # those that sleep
+        ({"OMP_NUM_THREADS": "2"}, {"choose": True}, (2, 2)),
+        ({"OMP_NUM_THREADS": "2"}, {"asked": 1}, (1, 1)),
+        ({"OMP_NUM_THREADS": "2"}, {"before": 1}, (1, 2)),  # it is used, and the record stays
+        ({}, {"before": 1}, (1, 1)),
+        ({}, {"asked": 1, "before": 2}, (1, 1)),
+        ({}, {}, (None, 2)),
+    ],
+)
+def test_the_user_the_run_and_the_idle_cores_say_how_many(
+    variables, given, used, asked, monkeypatch
+):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
     torch.set_num_threads(2)
-    fit(recipe_of(data), tmp_path / "run")
-    assert asked == []
-    assert recorded(tmp_path / "run") == 2
-
-
-def test_what_the_user_says_wins(data, tmp_path, monkeypatch, asked):
-    fit(recipe_of(data, cpu_threads=2), tmp_path / "recipe")
-    assert recorded(tmp_path / "recipe") == torch.get_num_threads() == 2
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
-    fit(recipe_of(data), tmp_path / "environment")
-    assert recorded(tmp_path / "environment") == 1
-    assert asked == []
+    given = {"asked": None, "before": None, "choose": False, **given}
+    assert (threads.use_threads(**given), torch.get_num_threads()) == used
+    assert len(asked) == (given["choose"] and not variables)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from acwm_core.training.callbacks import LastCheckpoint, NanGuard
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.progress import StepProgress
-from acwm_core.training.run import RunFolder
+from acwm_core.training.run_folder import RunFolder
 from acwm_core.training.sharding import ShardedStrategy
 from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
 from tests.tiny import tiny_world_model
@@ -64,14 +64,30 @@ def test_ours_make_room_for_the_users():
         ({"max_stesp": 1}, "max_stesp"),
         ({"max_steps": "many"}, "many"),
         ({"callbacks": [{"class_path": "lightning.Trainer"}]}, "Callback"),
+        ({"callbacks": [{"class_path": "nowhere.Thing"}]}, "No module named 'nowhere'"),
         ({"devices": 0}, "devices"),
+        ({"strategy": "dpp"}, "strategy='dpp'"),
+        ({"gradient_clip_val": 1.0, "gradient_clip_algorithm": "nrom"}, "nrom"),
+        ({"max_epochs": 3}, "set trainer.max_steps=… in place of trainer.max_epochs"),
+        ({"max_steps": -1}, "nothing says how long to train"),
+        ({"precision": "bf16-true"}, "use bf16-mixed"),
+        ({"logger": ["csv", "wandbb"]}, "did you mean 'wandb'"),
+        ({"logger": {"class_path": "lightning.pytorch.loggers.NoLogger"}}, "section trainer"),
     ],
 )
 def test_wrong_flags_are_one_sentence(flags, message):
-    with pytest.raises(RecipeError) as raised:
+    with pytest.raises((RecipeError, TrainingError)) as raised:
         build(**flags)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("config", [{"schedule": "linear"}, {"growing_horizon": 0.5}])
+def test_a_share_of_the_steps_needs_their_number(config):
+    flags = {"max_steps": -1, "max_time": "00:00:00:05", "accelerator": "cpu"}
+    build_trainer(flags, TrainingConfig(), [], [])
+    with pytest.raises(TrainingError, match=r"set trainer\.max_steps=…, or training\."):
+        build_trainer(flags, TrainingConfig(**config), [], [])
 
 
 @pytest.mark.parametrize(

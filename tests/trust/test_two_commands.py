@@ -9,12 +9,10 @@ import torch
 from click.testing import CliRunner
 
 from acwm_core.cli import main
-from acwm_core.errors import DataError, TrainingError
+from acwm_core.errors import DataError
 from acwm_core.files import alone, held, made_whole
 from acwm_core.plugins import catalog
-from acwm_core.training import fit as fitting
-from acwm_core.training import trained
-from acwm_core.training.fit import fit
+from acwm_core.training import run_folder
 from acwm_planning.resumable import ResumableResults
 from tests import tiny
 from tests.experiment import parts as experiment
@@ -74,41 +72,6 @@ def test_the_second_is_refused(run, tmp_path, monkeypatch, place, words):
     assert "Traceback" not in refused.output
 
 
-def recipe(data):
-    return tiny.tiny_recipe(data, trainer={"max_steps": 2})
-
-
-@pytest.fixture(scope="module")
-def data(parts, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "tiny_world"
-    words = ["generate", "tiny_world", "--split", "train", "--episodes", "4", "--workers", "0"]
-    assert CliRunner().invoke(main, [*words, "--out", str(folder)]).exit_code == 0
-    return folder
-
-
-@pytest.mark.parametrize("resumes", [False, True])
-def test_a_run_that_another_trained_since_it_was_looked_at_is_left(
-    data, tmp_path, monkeypatch, resumes
-):
-    """Both looked at the folder before either held it; the first has ended in the meantime."""
-    folder, usual = tmp_path / "run", fitting._callbacks
-    if resumes:
-        fit(recipe(data), folder)
-    longer = tiny.tiny_recipe(data, trainer={"max_steps": 4})
-    resume = folder if resumes else None
-
-    def overtaken(*given):
-        monkeypatch.setattr(fitting, "_callbacks", usual)
-        fit(longer, folder, resume=resume)
-        overtaken.found = checksums(folder)
-        return usual(*given)
-
-    monkeypatch.setattr(fitting, "_callbacks", overtaken)
-    with pytest.raises(TrainingError, match=r"another command has trained .* meanwhile"):
-        fit(longer, folder, resume=resume)
-    assert checksums(folder) == overtaken.found
-
-
 def test_settings_are_those_of_the_command_that_holds_the_results(tmp_path):
     folder = tmp_path / "results"
     folder.mkdir()
@@ -159,10 +122,10 @@ def test_what_a_killed_one_left_is_not_in_a_folder(tmp_path):
 def test_two_take_the_same_copy_of_a_trained_model(run, tmp_path, monkeypatch):
     """The second waits for the first, and copies nothing itself."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(trained, "find_run", lambda name: run)
-    trained.COPIES.mkdir(parents=True)
-    copy, found = trained.COPIES / "model", []
-    second = threading.Thread(target=lambda: found.append(trained.run_to_write("model")))
+    monkeypatch.setattr(run_folder, "find_run", lambda name: run)
+    run_folder.COPIES.mkdir(parents=True)
+    copy, found = run_folder.COPIES / "model", []
+    second = threading.Thread(target=lambda: found.append(run_folder.run_to_write("model")))
     with alone(copy):
         second.start()
         with made_whole(copy) as partial:

@@ -18,7 +18,8 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
-from acwm_core.training.run import RunFolder, all_training, load_run, read_metadata, save_weights
+from acwm_core.training.run import all_training, load_run, read_metadata, save_weights
+from acwm_core.training.run_folder import RunFolder
 from acwm_zoo import packing
 from acwm_zoo.packing import pack
 from tests import tiny

@@ -11,7 +11,8 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import Summary
 from acwm_core.model.build import build_world_model
 from acwm_core.recipe.recipe import compose
-from acwm_core.training.run import RunFolder, load_weights, read_metadata
+from acwm_core.training.run import load_weights, read_metadata
+from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.packing import FILES, MAX_BYTES
 from acwm_zoo.shipped import about, folder, shipped
 

@@ -21,8 +21,8 @@ from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import progress_bar
 from acwm_core.plugins import catalog
-from acwm_core.training.run import RunFolder, load_run
-from acwm_core.training.trained import find_run
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.episode import spec_of_seed
 from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, read_outcome
 from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge

@@ -1,4 +1,4 @@
-"""Finds runs by name: a folder, or a trained model from a plugin. Does not import torch."""
+"""Run folders, and how they are found by name. Does not import torch."""
 
 from __future__ import annotations
 
@@ -8,11 +8,50 @@ import shutil
 from pathlib import Path
 
 from acwm_core.errors import TrainingError
-from acwm_core.files import alone, made_whole, writing
+from acwm_core.files import alone, check_inside, made_whole, writing
 from acwm_core.plugins import catalog
 
 COPIES = Path("runs", "trained")
 """Folder for results of trained models, whose own folder may be part of a package."""
+
+OWN = (
+    *("recipe.yaml", "card.yaml", "*.safetensors", "metrics.csv", "README.md"),
+    *(
+        f"{folder}{rest}"
+        for folder in ("checkpoints", "samples", "evaluation", "planning")
+        for rest in ("", "/**/*")
+    ),
+)
+"""Patterns of acwm's own files in a run folder; loggers such as wandb write others."""
+
+
+class RunFolder:
+    """The paths of one run.
+
+    Attributes:
+        path: the folder, e.g. ``runs/push_cube``.
+        recipe: the fully expanded recipe; a folder that contains it holds a run.
+        card: a copy of the dataset's card.
+        checkpoints: folder of Lightning's checkpoints, `last.ckpt` and `best.ckpt`.
+        last_checkpoint: the checkpoint from which a run resumes.
+        weights: the averaged weights of model and conditioner, for prediction.
+        metrics: logged metrics by step, as CSV.
+        samples: sample videos made during training.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = path = Path(path)
+        self.recipe = path / "recipe.yaml"
+        self.card = path / "card.yaml"
+        self.checkpoints = path / "checkpoints"
+        self.last_checkpoint = self.checkpoints / "last.ckpt"
+        self.weights = path / "model.safetensors"
+        self.metrics = path / "metrics.csv"
+        self.samples = path / "samples"
+
+    def check_links(self) -> None:
+        """Refuse links that lead out of the folder among acwm's own files."""
+        check_inside(self.path, *OWN)
 
 
 def trained_models() -> list[str]:
