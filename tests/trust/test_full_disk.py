@@ -1,6 +1,8 @@
 """A disk that fills up under each command: one sentence, nothing half-written, no crash."""
 
 import json
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -24,6 +26,12 @@ def results(tmp_path_factory):
     return run(tmp_path_factory.mktemp("results") / "run", clips([20.0, 21.0, 22.0]))
 
 
+@pytest.fixture
+def release(tmp_path):
+    """Evaluations keep references there."""
+    return shutil.copytree(HERE, tmp_path / "release")
+
+
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory):
     """Of the smallest parts there are, and their dataset."""
@@ -45,8 +53,8 @@ def acting(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def lerobot(tmp_path_factory):
-    """The recordings of a dataset."""
+def recordings(tmp_path_factory):
+    """Those of a dataset, as LeRobot stores them."""
     home = tmp_path_factory.mktemp("lerobot")
     data, folder = shutil.copytree(HERE / "data", home / "data"), home / "recordings"
     words = ["data", "export", "lerobot", str(data), "--out", str(folder)]
@@ -89,118 +97,52 @@ def one_sentence(disks):
 
 
 QUICK = (
-    *("evaluation.episodes=2", "evaluation.counterfactual_episodes=0", "evaluation.steps=1"),
-    *("evaluation.perturbed_episodes=0", "evaluation.steps_sweep=[]", "evaluation.metrics=[psnr]"),
-    "evaluation.counterfactual_metrics=[]",
+    "evaluation.episodes=2 evaluation.counterfactual_episodes=0 evaluation.steps=1 "
+    "evaluation.perturbed_episodes=0 evaluation.steps_sweep=[] evaluation.metrics=[psnr] "
+    "evaluation.counterfactual_metrics=[]"
 )
+ACT = "planner.candidates=4 planner.iterations=1 planner.elites=2 planner.horizon=2"
 
 COMMANDS = {
-    "report": ((4, 40, 2000), "report", "RESULTS", "--out", "DISK/report.html"),
-    "leaderboard": ((4, 20, 500), "leaderboard", "RESULTS", "--out", "DISK/board.html"),
-    "hdf5": ((8, 60, 150, 20000), "data", "export", "hdf5", "DATA", "--out", "DISK/out"),
-    "new": ((8, 12, 20, 500), "new", "environment", "open_drawer", "--out", "DISK/a/drawer"),
+    "report": "report {results} --out DISK/report.html",
+    "hdf5": "data export hdf5 {release}/data --out DISK/out",
+    "leaderboard": "leaderboard {results} --out DISK/board.html",
+    "new": "new environment open_drawer --out DISK/a/drawer",
+    "export": "report {results} --out DISK/r.html --export DISK/tables",
+    "lerobot": "data export lerobot {release}/data --out DISK/out",
+    "preview": "data preview {release}/data --out DISK/out",
+    "rollout": "rollout {release}/run --data {release}/data --out DISK/rollout.mp4",
+    "strip": "rollout {release}/run --data {release}/data --out DISK/r.png",
+    "evaluate": f"evaluate {{release}}/run {QUICK} --data {{release}}/data --out DISK/scores",
+    "encode": "encode DISK/before --split all --codec compact --frames 9",
+    "import": "data import lerobot {recordings} --workers 0 --out DISK/out",
+    "fit": "fit {recipe} resume=auto --out DISK/run",
+    "plan": f"plan {{acting}} place {ACT} --videos 1 --out DISK/out",
+    "rank": "rank {acting} place --policies solution --policies behaviour --seeds 0 --out DISK/out",
+    "ship": f"ship {{acting}} evaluation.splits=[train] {QUICK} --out DISK/model",
 }
-
-MORE = {
-    "export": (
-        (8, 60, 200, 20000),
-        *("report", "RESULTS", "--out", "DISK/r.html", "--export", "DISK/tables"),
-    ),
-    "lerobot": ((8, 40, 100, 20000), "data", "export", "lerobot", "DATA", "--out", "DISK/out"),
-    "preview": ((8, 60, 20000), "data", "preview", "DATA", "--out", "DISK/out"),
-    "rollout": (
-        (8, 20, 20000),
-        *("rollout", "TRAINED", "--data", "DATA", "--out", "DISK/rollout.mp4"),
-    ),
-    "evaluate": (
-        (8, 20, 20000),
-        *("evaluate", "TRAINED", *QUICK, "--data", "DATA", "--out", "DISK/scores"),
-    ),
-    "strip": ((8, 20, 20000), "rollout", "TRAINED", "--data", "DATA", "--out", "DISK/r.png"),
-}
+USUAL = ("report", "hdf5")
+"""Those that write a file, and a folder of them; the others are tried by `make test-all`."""
 
 
-ACT = ("planner.candidates=4", "planner.iterations=1", "planner.elites=2", "planner.horizon=2")
-
-ACTING = {
-    "plan": ((8, 20, 20000), "plan", "RUN", "place", *ACT, "--videos", "1", "--out", "DISK/out"),
-    "rank": (
-        (8, 20, 20000),
-        *("rank", "RUN", "place", "--policies", "solution", "--policies", "behaviour"),
-        *("--seeds", "0", "--out", "DISK/out"),
-    ),
-    "ship": (
-        (8, 20, 20000),
-        *("ship", "RUN", "evaluation.splits=[train]", *QUICK, "--out", "DISK/model"),
-    ),
-}
-
-
-def try_command(results, tmp_path, sizes, command):
+@pytest.mark.parametrize(
+    "name",
+    [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in COMMANDS],
+)
+def test_disks_of_many_sizes(name, request, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
-    release = shutil.copytree(HERE, tmp_path / "release")  # evaluations keep references there
-    places = {"RESULTS": results, "DATA": release / "data", "TRAINED": release / "run"}
-    one_sentence(on_disks(disk, sizes, *(places.get(each, each) for each in command)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ACTING)
-def test_acting_on_disks_of_many_sizes(acting, tmp_path, name):
-    sizes, *command = ACTING[name]
-    many = sorted({*sizes, 4, 32})
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    one_sentence(on_disks(disk, many, *(acting if each == "RUN" else each for each in command)))
-
-
-@pytest.mark.slow
-def test_encoding_on_disks_of_many_sizes(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ("encode", "DISK/before", "--split", "all", "--codec", "compact", "--frames", "9")
-    one_sentence(on_disks(disk, (0, 8, 16, 32, 64, 20000), *command, before=str(HERE / "data")))
-
-
-@pytest.mark.slow
-def test_importing_on_disks_of_many_sizes(lerobot, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ("data", "import", "lerobot", lerobot, "--workers", "0", "--out", "DISK/out")
-    one_sentence(on_disks(disk, (4, 8, 16, 40, 100, 20000), *command))
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_disks_of_several_sizes(results, tmp_path, name):
-    sizes, *command = COMMANDS[name]
-    try_command(results, tmp_path, sizes, command)
-
-
-FIT = ("fit", "RECIPE", "resume=auto", "--out", "DISK/run")
-
-
-def whole_checkpoints(disks):
-    """None is cut short, and those that fit in are kept."""
+    words = []
+    for word in shlex.split(COMMANDS[name]):
+        places = {each: request.getfixturevalue(each) for each in re.findall(r"{(\w+)}", word)}
+        words.append(word.format(**places))
+    sizes = (4, 40, 20_000) if name in USUAL else (0, 8, 24, 40, 80, 140, 200, 400, 20_000)
+    disks = on_disks(disk, sizes, *words, before=str(HERE / "data") if name == "encode" else "")
     one_sentence(disks)
-    kept = [any(file.endswith("last.ckpt") for file in disk["files"]) for disk in disks]
-    assert kept == sorted(kept)
-    assert any(kept[:-1])
-
-
-@pytest.mark.slow
-def test_training_on_disks_of_many_sizes(recipe, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = [recipe if each == "RECIPE" else each for each in FIT]
-    whole_checkpoints(on_disks(disk, (8, 24, 40, 80, 140, 200, 20_000), *command))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", {**COMMANDS, **MORE})
-def test_disks_of_many_sizes(results, tmp_path, name):
-    sizes, *command = {**COMMANDS, **MORE}[name]
-    many = sorted({*sizes, *range(8, 400, 56)})
-    try_command(results, tmp_path, many, command)
+    if name == "fit":  # no checkpoint is cut short, and those that fit in are kept
+        kept = [any(file.endswith("last.ckpt") for file in disk["files"]) for disk in disks]
+        assert kept == sorted(kept)
+        assert any(kept[:-1])
 
 
 def test_a_refusal_without_a_number_is_the_disks_if_it_is_full(tmp_path, monkeypatch):
