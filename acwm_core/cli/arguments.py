@@ -144,9 +144,6 @@ def split_options(
 
     Args:
         section: the section to split off, instead of ``executor``.
-
-    Raises:
-        RecipeError: a value is not YAML.
     """
     from acwm_core.recipe.compose import merge, parse_override
 

@@ -69,11 +69,7 @@ def build_objective(choice: ComponentConfig) -> Objective[Any]:
 def build_model(
     choice: ComponentConfig, objective: Objective[Any], latent_channels: int
 ) -> DynamicsModel:
-    """Build the dynamics model that a recipe names, as the objective needs it.
-
-    Raises:
-        RecipeError: the objective cannot train this model.
-    """
+    """Build the dynamics model that a recipe names, as the objective needs it."""
     wanted = {"causal": objective.causal, "inputs": objective.inputs}
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
@@ -85,11 +81,7 @@ def build_model(
 def build_conditioner(
     choice: ComponentConfig, model: DynamicsModel, action_size: int, temporal_stride: int
 ) -> Conditioner:
-    """Build the conditioner that a recipe names, to fit a model.
-
-    Raises:
-        RecipeError: it is made for layers of one width, and the model's differ.
-    """
+    """Build the conditioner that a recipe names, to fit a model."""
     fitted: dict[str, Any] = {
         "action_size": action_size,
         "temporal_stride": temporal_stride,

@@ -48,10 +48,6 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     Returns:
         The parameters of each section, converted to the types of their constructors. Components
         also have a `name`; an optional component that was not given is missing.
-
-    Raises:
-        RecipeError: an unknown section, component or parameter, a wrong type, or something missing.
-        PluginError: a registered target does not exist.
     """
     recipe = resolved(with_current_sections(recipe))
     values = check_names(recipe)
@@ -105,10 +101,6 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
 
     The parameters that all environments have are checked without importing the simulator. Where a
     component's requirements are not installed, its parameters are not checked.
-
-    Raises:
-        RecipeError: an unknown component or parameter, or a wrong type.
-        PluginError: a registered target does not exist.
     """
     component, params = _component(section, choice)
     inherited = params.pop(INHERITED, {})

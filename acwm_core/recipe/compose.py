@@ -30,9 +30,6 @@ def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
         overrides: ``+overlay``, ``section.parameter=value`` or ``component=name``; values are
             YAML. Order matters only between two overrides of one parameter (the last one
             counts) and between overlays, which are applied in order.
-
-    Raises:
-        RecipeError: a file is missing, extends itself or is not YAML, or an override is malformed.
     """
     path = find_recipe(str(name), Path())
     return with_overrides(_laid_over({}, path), overrides, path.parent)
@@ -45,9 +42,6 @@ def with_overrides(
 
     Args:
         folder: the folder of the recipe. Its own overlays take precedence over packaged ones.
-
-    Raises:
-        RecipeError: an override is malformed, or an overlay does not exist.
     """
     changes: dict[str, Any] = {}
     for override in overrides:

@@ -30,12 +30,7 @@ class MetricConfig:
     params: Mapping[str, Any] = field(default_factory=dict[str, Any])  # constructor arguments
 
     def create(self) -> Any:
-        """Construct the metric; for ``LIBRARY.path.Class``, as ``LIBRARY(metric_class=...)``.
-
-        Raises:
-            RecipeError: no such metric is registered.
-            MissingExtraError: its library is not installed.
-        """
+        """Construct the metric; for ``LIBRARY.path.Class``, as ``LIBRARY(metric_class=...)``."""
         registered, dot, _ = self.component.partition(".")
         of_library = {LIBRARY_CLASS: self.component} if dot else {}
         return catalog().create("metric", registered, **of_library, **self.params)

@@ -75,11 +75,7 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, sections: Mapping[str, Any]) -> Recipe:
-        """Check the sections of a recipe file and build a recipe from them.
-
-        Raises:
-            RecipeError: a name, parameter or type is wrong.
-        """
+        """Check the sections of a recipe file and build a recipe from them."""
         checked: dict[str, Any] = {"env": None, **validate(sections)}
         for section in COMPONENTS:
             if params := checked[section]:

@@ -272,11 +272,7 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
 
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
-    """Write the weights as float16, with a record of how they were made.
-
-    Raises:
-        DataError: a weight is not finite; an older file is kept.
-    """
+    """Write the weights as float16, with a record of how they were made."""
     state = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in codec.state_dict().items()

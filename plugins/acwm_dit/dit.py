@@ -86,11 +86,7 @@ class DiT(Denoiser):
     def forward(
         self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, **inputs: Tensor
     ) -> Latent:
-        """Evaluate the model; see `Denoiser.forward`.
-
-        Raises:
-            ShapeError: the channels are not the codec's, or the sides do not divide into patches.
-        """
+        """Evaluate the model; see `Denoiser.forward`."""
         return self._evaluate(latents, sigma, conditioning, inputs, None)
 
     def new_cache(self, context: int) -> Cache:

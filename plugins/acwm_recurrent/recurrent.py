@@ -76,11 +76,7 @@ class RecurrentModel(Predictor):
             nn.init.zeros_(parameter)
 
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
-        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
-
-        Raises:
-            ShapeError: the latents do not have the codec's number of channels.
-        """
+        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`."""
         known = given.shape[1]
         actions = self.actions(conditioning)
         state = self.start(given, actions[:, 0])

@@ -74,14 +74,6 @@ def test_what_type_checkers_read_is_what_is_imported():
         assert read[name] is getattr(acwm, name), name
 
 
-def test_the_import_is_light_and_the_first_use_is_not():
-    code = (
-        "import sys, acwm; assert not {'torch', 'lightning', 'scipy'} & {*sys.modules};"
-        "acwm.build_world_model; assert 'torch' in sys.modules and 'lightning' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 def test_a_misspelt_name_is_an_attribute_error_that_knows_the_near_one():
     code = "import acwm; acwm.build_wold_model"
     failed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
