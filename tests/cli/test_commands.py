@@ -144,9 +144,18 @@ def test_check_passes_on_our_own_and_fails_on_a_bad_one(monkeypatch: pytest.Monk
     assert (bad.exit_code, "FAIL" in bad.output) == (1, True)
 
 
-def test_check_of_a_metric_takes_its_parameters_and_an_environment() -> None:
-    assert run("check", "mask_iou", "env=push_cube").exit_code == 0
-    assert "needs weights: give" in run("check", "lpips", "metric.network=vgg").stdout
+def test_check_of_a_metric_takes_its_parameters_and_an_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = dict[str, Any]()
+
+    def suite(name: str, **parameters: Any) -> list[Any]:
+        given.update(parameters)
+        return []
+
+    monkeypatch.setattr("acwm_core.checks.check_metric", suite)
+    assert run("check", "lpips", "metric.network=vgg", "env=push_cube").exit_code == 0
+    assert given == {"network": "vgg", "environment": "push_cube"}
     assert "did you mean 'network'?" in refused("check", "lpips", "metric.netwrok=vgg")
     assert "metric.network=res: expected" in refused("check", "lpips", "metric.network=res")
     assert "did you mean 'push_cube'?" in refused("check", "mask_iou", "env=push_cub")
