@@ -37,10 +37,10 @@ def test_a_stream_shows_what_its_latents_decode_to(name, request):
     world = WorldModel(*parts, [-1.0, -1.0], [1.0, 1.0]).eval()
     first = torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(0))
     stream = world.stream(first, context=3)
-    frames, latents = [stream.first[:, None]], [stream._latents._unkept]
+    frames, latents = [stream.first[:, None]], [stream._latents.last]
     for _ in range(4):
         frames.append(stream.step(torch.zeros(2, stride, 2)))
-        latents.append(stream._latents._unkept)
+        latents.append(stream._latents.last)
     with torch.no_grad():
         whole = codec.decode(torch.cat(latents, 1))
     assert whole.shape[1] == 1 + 4 * stride

@@ -160,7 +160,7 @@ def test_within_the_context_it_is_the_model_as_it_was_trained():
             with torch.no_grad():
                 whole = world.model(torch.cat([past, noisy], 1), levels, conditioning)
             torch.testing.assert_close(predicted, whole[:, -1:], rtol=0, atol=1e-5)
-        past = torch.cat([past, stream._latents._unkept], 1)
+        past = torch.cat([past, stream._latents.last], 1)
         torch.testing.assert_close(world.codec.decode(past)[:, -4:], decoded)
 
 
@@ -170,9 +170,7 @@ def test_memory_does_not_grow():
     sizes = []
     for _ in range(3 * CONTEXT):
         stream.step(actions(1))
-        kept = {
-            part.untyped_storage().data_ptr(): part for part in stream._latents._cache.tensors()
-        }
+        kept = {part.untyped_storage().data_ptr(): part for part in stream._latents.cache.tensors()}
         assert not any(part.requires_grad for part in kept.values())
         sizes.append(sum(part.untyped_storage().nbytes() for part in kept.values()))
     assert sizes[0] < sizes[CONTEXT - 2] == sizes[CONTEXT - 1] == sizes[-1]
