@@ -25,6 +25,7 @@ from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.filesystem import FileSystemReader
 
 from acwm_core.errors import TrainingError
+from acwm_core.files import written_whole
 
 META = "meta.pt"
 """File in a folder with everything but the tensors of the model and the optimiser."""
@@ -204,22 +205,25 @@ def write_folder(
     if strategy.is_global_zero:
         apart = ("state_dict", "optimizer_states")
         details = {key: value for key, value in checkpoint.items() if key not in apart}
-        _save(partial / META, {**details, "optimizer_groups": list(optimizer["param_groups"])})
-        _put_in_place(partial, path)
+        with (partial / META).open("wb") as file:
+            torch.save({**details, "optimizer_groups": list(optimizer["param_groups"])}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            _set_aside(path)
+        partial.rename(path)
+        _remove(_old(path))
     strategy.barrier()
 
 
 def write_file(path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Write a checkpoint as one file, and wait until it is on the disk."""
-    partial = path.with_name(f".{path.name}.partial")
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remove(partial)
-    try:
-        _save(partial, checkpoint)
-    except BaseException:
-        _remove(partial)
-        raise
-    _put_in_place(partial, path)
+    if path.is_dir():  # no file can replace it in one system call
+        _set_aside(path)
+    with written_whole(path) as partial, partial.open("wb") as file:
+        torch.save(checkpoint, file)
+    _remove(_old(path))
 
 
 def flat(
@@ -232,23 +236,10 @@ def flat(
     return tensors
 
 
-def _save(path: Path, values: Mapping[str, Any]) -> None:
-    with path.open("wb") as file:
-        torch.save(values, file)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _put_in_place(partial: Path, path: Path) -> None:
-    old = _old(path)
-    if partial.is_dir() or path.is_dir():  # a folder cannot be replaced in one system call
-        if path.exists():
-            _remove(old)
-            path.rename(old)
-        partial.rename(path)
-    else:
-        partial.replace(path)
-    _remove(old)
+def _set_aside(path: Path) -> None:
+    """Keep the last checkpoint under another name until the new one is in its place."""
+    _remove(_old(path))
+    path.rename(_old(path))
 
 
 def _old(path: Path) -> Path:

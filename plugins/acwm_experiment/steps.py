@@ -16,6 +16,7 @@ from acwm_core.files import parse_json
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.recipe.compose import read_recipe, recipe_folder
+from acwm_core.training.run_folder import RunFolder
 from acwm_executors.batch import Job
 from acwm_experiment.files import slug
 from acwm_experiment.plan import ExperimentPlan
@@ -23,9 +24,6 @@ from acwm_experiment.runs import DatasetSpec, RunSpec
 from acwm_experiment.table import EXPERIMENT_FILE, RUN_SUMMARY
 from acwm_experiment.tasks import PlanCommand
 from acwm_planning.jobs import PLAN_SUMMARY
-
-WEIGHTS, RECIPE = "model.safetensors", "recipe.yaml"
-"""Files of a run folder, named here because `acwm_core.training.run.RunFolder` needs torch."""
 
 _recipe = functools.cache(Recipe.from_yaml)  # the recipe of a run never changes
 
@@ -163,9 +161,9 @@ def training_progress(run: RunSpec) -> float:
     Raises:
         TrainingError: the run folder holds another run.
     """
-    if not (run.folder / RECIPE).is_file():
+    if not RunFolder(run.folder).recipe.is_file():
         return 0.0
-    differences = recipe_differences(_recipe(run.folder / RECIPE), run.recipe)
+    differences = recipe_differences(_recipe(RunFolder(run.folder).recipe), run.recipe)
     steps = saved_steps(run.folder)
     if steps > run.max_steps:
         differences.append(f"trainer.max_steps was {steps}, is {run.max_steps}")
@@ -183,7 +181,7 @@ def saved_steps(run: Path) -> int:
 
     safe_open = cast(Any, safetensors).safe_open
     try:
-        with safe_open(run / WEIGHTS, framework="np") as file:
+        with safe_open(RunFolder(run).weights, framework="np") as file:
             metadata: dict[str, str] = file.metadata() or {}
         return int(parse_json(metadata["acwm"])["step"])
     except (OSError, safetensors.SafetensorError, LookupError, TypeError, ValueError):
@@ -192,7 +190,7 @@ def saved_steps(run: Path) -> int:
 
 def is_evaluated(run: RunSpec) -> bool:
     """Whether the weights of a finished run were evaluated with its current recipe."""
-    summary, weights = run.folder / RUN_SUMMARY, run.folder / WEIGHTS
+    summary, weights = run.folder / RUN_SUMMARY, RunFolder(run.folder).weights
     try:
         provenance: Mapping[str, Any] = parse_json(summary.read_bytes())["provenance"]
         newer = summary.stat().st_mtime_ns >= weights.stat().st_mtime_ns
@@ -211,6 +209,6 @@ def evaluation_overrides(run: RunSpec) -> list[str]:
     evaluation = EvaluationConfig(**run.recipe.evaluation).to_dict()
     defaults = read_recipe(recipe_folder() / "base.yaml")["evaluation"]
     overrides = setting_overrides({**EvaluationConfig().to_dict(), **defaults}, evaluation)
-    if (run.folder / RECIPE).is_file():
-        overrides += setting_overrides(_recipe(run.folder / RECIPE).evaluation, evaluation)
+    if RunFolder(run.folder).recipe.is_file():
+        overrides += setting_overrides(_recipe(RunFolder(run.folder).recipe).evaluation, evaluation)
     return list(dict.fromkeys(overrides))
