@@ -39,9 +39,9 @@ def test_folding_keeps_every_frame_exactly():
     [
         ("push_cube", 64, "ind_test", 31),
         ("push_cube", 64, "ood_test", 29),
-        ("push_cube", 240, "ind_test", 33),
+        pytest.param("push_cube", 240, "ind_test", 33, marks=pytest.mark.slow),
         ("reacher", 64, "ind_test", 32),
-        ("reacher", 64, "ood_test", 32),
+        pytest.param("reacher", 64, "ood_test", 32, marks=pytest.mark.slow),
     ],
 )
 def test_shipped_weights_reconstruct_scenes_they_never_saw(codec, name, size, split, decibels):

@@ -61,6 +61,7 @@ def test_hard_sources_count_for_less_than_their_error_and_for_more_than_their_de
     assert running.decibels() == pytest.approx([-10 * math.log10(0.04), 20])
 
 
+@pytest.mark.slow
 def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
     torch.manual_seed(0)
     codec = Compact(weights="random").train()

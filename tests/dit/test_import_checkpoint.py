@@ -57,8 +57,7 @@ def wan(tmp_path_factory):
     return f"codec.weights={folder}"
 
 
-@pytest.mark.parametrize("prefix", ["model.", "module.model."])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(("name", "prefix"), zip(CASES, ("model.", "module.model."), strict=True))
 def test_an_imported_run_computes_what_the_published_network_does(
     name, prefix, latest, wan, tmp_path
 ):
@@ -163,25 +162,13 @@ def test_the_codec_comes_along_if_its_weights_do(latest, tmp_path, monkeypatch):
     load_run("other")
 
 
-def test_training_from_a_run_that_is_none_is_refused(latest, wan, data, tmp_path):
-    words = (wan, "model.heads=4", f"data.path={data}")
-    made = import_checkpoint(latest(content()), tmp_path / "run", words)
-    recipe = str(made.run / "recipe.yaml")
-    fit = ["fit", recipe, "--out", str(tmp_path / "tuned")]
-    done = CliRunner().invoke(main, [*fit, f"training.init_from={tmp_path / 'nowhere'}"])
-    assert done.exit_code == 2
-    assert "nowhere: there is no run with trained weights" in done.output
-    assert not (tmp_path / "tuned").exists()
-
-
-@pytest.mark.parametrize("resume", [None, "auto", "run"])
-def test_training_does_not_write_over_imported_weights(resume, latest, wan, data, tmp_path):
+def test_training_does_not_write_over_imported_weights(latest, wan, data, tmp_path):
     words = (wan, "model.heads=4", f"data.path={data}")
     made = import_checkpoint(latest(content()), tmp_path / "run", words)
     before = (made.run / "model.safetensors").read_bytes()
-    goes_on = made.run if resume == "run" else resume
-    with pytest.raises(TrainingError, match=r"imported weights.*training\.init_from="):
-        fit(made.recipe, made.run, resume=goes_on)
+    for resume in (None, "auto", made.run):
+        with pytest.raises(TrainingError, match=r"imported weights.*training\.init_from="):
+            fit(made.recipe, made.run, resume=resume)
     assert (made.run / "model.safetensors").read_bytes() == before
 
 
@@ -195,6 +182,7 @@ def test_a_run_is_not_overwritten(latest, tmp_path):
 PAGE = Path(__file__).parents[2] / "docs" / "published-checkpoints.md"
 
 
+@pytest.mark.documents
 def test_every_command_of_the_page_works(latest, wan, data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     latest(content())
