@@ -1,4 +1,4 @@
-"""The `Planner`, `Cost` and `Driver` interfaces: who chooses actions, and what rates them."""
+"""The `Planner` and `Cost` interfaces: what chooses actions, and what rates them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from acwm_core.env.physics import Observation
@@ -77,31 +75,3 @@ class Cost(ABC):
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """Return a cost per candidate, `[N]`; lower is better, NaN is worst."""
-
-
-class Driver(ABC):
-    """Solves a task in a simulator of which it sees pictures only, as in `acwm play`.
-
-    It is made with `world_model`, the `card` of the simulator, `task`, `usual` (standard deviation
-    `[A]` of the raw actions that the model was trained on, or None) and `steps` (sampling steps, or
-    None for the model's own number).
-    """
-
-    @abstractmethod
-    def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
-        """Aim at a goal from now on. `still` is the raw action `[A]` that means no motion now."""
-
-    @abstractmethod
-    def act(
-        self,
-        frames: Sequence[Frame],
-        actions: Sequence[NDArray[np.float32]],
-        check: Callable[[], None],
-    ) -> Sequence[NDArray[np.float32]]:
-        """The next raw actions, `[A]` each, at least one.
-
-        Args:
-            frames: the last frames, `[H, W, 3]` each, up to now.
-            actions: the raw actions between them, `[A]` each.
-            check: to be called often; it raises once nobody waits for the answer.
-        """

@@ -1,4 +1,4 @@
-"""Registers the kinds planner, cost and driver, some of each, `acwm plan` and `acwm rank`."""
+"""Registers the kinds planner and cost, some of each, `acwm plan` and `acwm rank`."""
 
 from acwm_core.plugins import Registry, hookimpl
 
@@ -16,11 +16,6 @@ def register_kinds(registry: Registry) -> None:
         "cost",
         "acwm_planning.planner:Cost",
         summary="how far imagined futures are from a goal",
-    )
-    registry.add(
-        "driver",
-        "acwm_planning.planner:Driver",
-        summary="solves a task in `acwm play`, from pictures",
     )
 
 
@@ -70,16 +65,6 @@ def register_costs(registry: Registry) -> None:
         "callable",
         "acwm_planning.costs:UserCost",
         summary="a function of yours: cost.function=module:name",
-    )
-
-
-@hookimpl
-def register_drivers(registry: Registry) -> None:
-    """Add a driver."""
-    registry.add(
-        "planner",
-        "acwm_planning.driver:PlanningDriver",
-        summary="plans with the model that is played",
     )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, PluginError, check_shape, noting
-from acwm_planning.planner import Driver
+from acwm_play.driver import Driver
 from acwm_play.live_world import LiveWorld
 from acwm_play.simulator import TimeStep
 

@@ -1,6 +1,26 @@
-"""Registers the command."""
+"""Registers the kind driver, one that plans, and `acwm play`."""
 
 from acwm_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_kinds(registry: Registry) -> None:
+    """Add the kind of component that acts in the place of a person."""
+    registry.add(
+        "driver",
+        "acwm_play.driver:Driver",
+        summary="solves a task in `acwm play`, from pictures",
+    )
+
+
+@hookimpl
+def register_drivers(registry: Registry) -> None:
+    """Add a driver."""
+    registry.add(
+        "planner",
+        "acwm_play.planning_driver:PlanningDriver",
+        summary="plans with the model that is played",
+    )
 
 
 @hookimpl

@@ -16,8 +16,8 @@ from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import find_run
-from acwm_planning.planner import Driver
 from acwm_planning.run import usual_actions
+from acwm_play.driver import Driver
 from acwm_play.live_model import LiveModel
 from acwm_play.worlds import World
 

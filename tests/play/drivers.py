@@ -11,7 +11,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import TaskEnvironment
 from acwm_core.plugins import catalog
-from acwm_planning.planner import Driver
+from acwm_play.driver import Driver
 from tests.plugins import plugin_of
 
 

@@ -1,4 +1,4 @@
-"""Lets a planner act in a simulator of which it sees pictures only, as in `acwm play`."""
+"""Lets a planner act in a simulator of which it sees pictures only."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from acwm_core.model.shapes import Actions
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.controllers import PlanningController, Rollouts
 from acwm_planning.futures import GoalCost, History, ModelRollouts
-from acwm_planning.planner import Driver, RolloutCost
+from acwm_planning.planner import RolloutCost
 from acwm_planning.run import make_cost, make_planner
 from acwm_planning.settings import settings_of
+from acwm_play.driver import Driver
 
 
 class PlanningDriver(Driver):

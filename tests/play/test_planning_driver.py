@@ -8,9 +8,9 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_planning.controllers import PlanningController
 from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.planner import Driver
 from acwm_planning.run import make_cost, make_planner
 from acwm_planning.settings import settings_of
+from acwm_play.driver import Driver
 from tests import tiny
 
 FEW = (
@@ -23,9 +23,10 @@ class Quick(tiny.ToPlace):
     planning = FEW
 
 
-@pytest.fixture
-def bundle(run):
-    return load_run(run)
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    tiny.register()
+    return load_run(tiny.make_slide_run(tmp_path_factory.mktemp("planning")))
 
 
 @pytest.fixture
