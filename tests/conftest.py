@@ -13,6 +13,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, here and in children
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from acwm_core.plugins import catalog
 from tests.browsing import chromium
@@ -41,6 +42,18 @@ def pytest_collection_modifyitems(items):
         if "browser" in item.fixturenames:
             item.add_marker("browser")
     items.sort(key=lambda item: not item.nodeid.startswith(DEAREST))
+
+
+class Scheduling(LoadFileScheduling):
+    """A file's tests run in one process, as they share fixtures; a world's suite does alone."""
+
+    def _split_scope(self, nodeid):
+        return nodeid if "environments_conform[" in nodeid else super()._split_scope(nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    return Scheduling(config, log)
 
 
 @pytest.fixture(scope="session", autouse=True)
