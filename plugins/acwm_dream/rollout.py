@@ -34,7 +34,7 @@ from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
 from acwm_core.model.world_model import Mode
 from acwm_core.plugins import catalog
-from acwm_core.training.run import load_run
+from acwm_core.training.run import RunBundle, load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 
 SQUEEZED = 0.02
@@ -98,37 +98,57 @@ def rollout_run(
         raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     bundle = load_run(run)
     given, rows, truth = None, None, None
-    context = bundle.world_model.context_frames
     if actions is None or image is None:
-        folder = data or bundle.recipe.data["path"]
-        if data or ":" in str(folder) or (Path(folder) / CARD).exists():
-            truth, rows = _read_episode(EpisodeDataset(folder, split), episode, bundle.card)
-        else:
-            truth, rows = _simulate_episode(
-                DatasetCard.read(RunFolder(find_run(run)).card), split, episode
-            )
-        given = truth[:context]
-        if len(truth) <= context:
-            raise DataError(f"episode {episode} has {len(truth)} frames, and {context} are given")
+        truth, rows = _recorded(find_run(run), bundle, data, split, episode)
+        given = truth[: bundle.world_model.context_frames]
     if image is not None:
-        if context > 1:
-            raise RecipeError(f"this model starts from {context} frames, and --image gives one")
-        given, truth = _read_image(Path(image), bundle.card.frame_size)[None], None
+        given, truth = _read_start(Path(image), bundle), None
     if actions is not None:
-        chosen = _read_actions(Path(actions), bundle.card.action)
-        before = np.zeros((0, chosen.shape[1]), np.float32) if rows is None else rows[: context - 1]
-        rows, truth = np.concatenate([before, chosen]), None
+        rows, truth = _with_chosen(Path(actions), rows, bundle), None
     assert given is not None
     assert rows is not None
     model = bundle.world_model.to(choose_device(device))
     where = model.action_low.device
-    seeds, inputs = [seed], torch.tensor(rows)[None].to(where)
+    inputs = torch.tensor(rows)[None].to(where)
     check_pixels(given)
     model.checked(inputs[:, :-1])
-    start = given[None].to(where)
-    chunks = model.rollout_chunks(start, inputs, mode=mode, steps=steps, seeds=seeds)
+    chunks = model.rollout_chunks(
+        given[None].to(where), inputs, mode=mode, steps=steps, seeds=[seed]
+    )
     _write(out, _frames(chunks, truth), len(rows), bundle.card)
     return out
+
+
+def _recorded(
+    run: Path, bundle: RunBundle, data: str | Path | None, split: Split, episode: int
+) -> tuple[Clip, NDArray[np.float32]]:
+    """The episode's video and actions; without a dataset it is simulated."""
+    folder = data or bundle.recipe.data["path"]
+    if data or ":" in str(folder) or (Path(folder) / CARD).exists():
+        video, rows = _read_episode(EpisodeDataset(folder, split), episode, bundle.card)
+    else:
+        video, rows = _simulate_episode(DatasetCard.read(RunFolder(run).card), split, episode)
+    context = bundle.world_model.context_frames
+    if len(video) <= context:
+        raise DataError(f"episode {episode} has {len(video)} frames, and {context} are given")
+    return video, rows
+
+
+def _read_start(image: Path, bundle: RunBundle) -> Clip:
+    context = bundle.world_model.context_frames
+    if context > 1:
+        raise RecipeError(f"this model starts from {context} frames, and --image gives one")
+    return _read_image(image, bundle.card.frame_size)[None]
+
+
+def _with_chosen(
+    actions: Path, rows: NDArray[np.float32] | None, bundle: RunBundle
+) -> NDArray[np.float32]:
+    """The chosen actions, after those between the given frames, of the recorded `rows`."""
+    chosen = _read_actions(actions, bundle.card.action)
+    if rows is None:
+        return chosen
+    return np.concatenate([rows[: bundle.world_model.context_frames - 1], chosen])
 
 
 def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from huggingface_hub import HfApi
 
 from acwm_core.errors import AcwmError, TrainingError
-from acwm_core.files import written_whole
+from acwm_core.files import inside, written_whole
 from acwm_zoo.packing import FILES
 
 SCHEME = "hf://"
@@ -41,19 +41,16 @@ def fetch(address: str = "") -> Path:
 
 
 def _without_links(folder: Path) -> None:
-    """Replace links by copies: the Hub's cache uses links, and a run folder may not hold links.
+    """Replace the links of the Hub's cache by copies: a run's files lie in its own folder.
 
     Raises:
-        TrainingError: a link leads out of the cache.
+        DataError: a link leads out of the cache.
     """
-    blobs = folder.resolve().parents[1] / "blobs"
-    for file in [*folder.rglob("*")]:
-        if file.is_symlink():
-            content = file.resolve()
-            if content.parent != blobs or not content.is_file():
-                raise TrainingError(f"{file} is a link that leads out of the cache: remove it")
+    cache = folder.parents[1]
+    for file in [each for pattern in FILES for each in folder.glob(pattern)]:
+        if file.is_symlink() and inside(cache, str(file.relative_to(cache))).is_file():
             with written_whole(file) as partial:
-                shutil.copyfile(content, partial)
+                shutil.copyfile(file.resolve(), partial)
 
 
 def create(address: str) -> str:

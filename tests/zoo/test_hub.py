@@ -169,14 +169,16 @@ def test_a_fetch_that_is_stopped_leaves_no_half_a_file(cached, monkeypatch):
     assert not [file for file in cached.rglob("*") if file.is_symlink() or "partial" in file.name]
 
 
-@pytest.mark.parametrize("target", ["/etc/passwd", "not-there", "/"])
+@pytest.mark.parametrize("target", ["/etc/passwd", "/"])
 def test_links_that_lead_out_of_the_cache_are_not_followed(cached, target):
-    (cached / "notes.txt").symlink_to(target)
+    link = cached / "recipe.yaml"
+    link.unlink()
+    link.symlink_to(target)
     done = invoke("rollout", "hf://org/name")
     assert done.exit_code == 2
     said = done.output.splitlines()[-1]  # below the bars of the download
-    assert said == f"acwm: {cached / 'notes.txt'} is a link that leads out of the cache: remove it"
-    assert (cached / "notes.txt").is_symlink()
+    assert said.startswith(f"acwm: {link} leads out of ")
+    assert link.is_symlink()
 
 
 @pytest.mark.parametrize(
