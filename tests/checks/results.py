@@ -5,12 +5,23 @@ from collections.abc import Iterable
 import pytest
 
 from acwm_core.checks import CheckResult
+from acwm_core.checks.result import checks_of
 from acwm_core.plugins import Component, catalog
 
 
 def in_words(check) -> str:
     """The name under which a check function reports."""
     return check.__name__.replace("_", " ")
+
+
+def only_run(name, monkeypatch):
+    """Leave out the checks of suites but the one of that name, and the first, which may end all."""
+
+    def kept(suite):
+        first, *others = checks_of(suite)
+        return [first, *(check for check in others if in_words(check) == name)]
+
+    monkeypatch.setattr("acwm_core.checks.result.checks_of", kept)
 
 
 def failures(results: Iterable[CheckResult]) -> dict[str, str]:
