@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 import signal
 
 import pytest
@@ -155,10 +156,10 @@ STEPS = 5  # one dataset, training, evaluation and plan, a report
 
 
 @pytest.fixture(scope="module")
-def planned(acwm, whole, tmp_path_factory):
+def planned(acwm, tmp_path_factory):
     """An experiment with a plan, and what was printed."""
     folder = tmp_path_factory.mktemp("planned")
-    write_experiment(folder, TINY, whole)
+    write_experiment(folder, TINY)
     code, out, err = acwm("experiment", "widths.yaml", cwd=folder)
     assert code == 0, out + err
     return folder, out, err
@@ -172,7 +173,7 @@ def episodes(folder):
 def test_a_model_is_trained_and_plans(planned, acwm):
     folder, out, err = planned
     made = folder / "experiments" / "widths"
-    assert out.splitlines()[0] == f"{STEPS} of {STEPS} steps are done, 1 of them in earlier runs"
+    assert out.splitlines()[0] == f"{STEPS} of {STEPS} steps are done"
     assert "plan Corners · Narrow: done" in err
     both = [(row, seed) for seed in (0, 1) for row in ("model", "still")]  # it has no solution
     assert episodes(made / "planning" / NAME) == both
@@ -191,7 +192,7 @@ def test_a_run_of_one_s_own_plans_without_training(planned, acwm, tmp_path):
     run = planned[0] / "experiments" / "widths" / "runs" / "tiny-0"
     text = f"plans: {{Own: {{tasks: {{Tiny: {run} corner {QUICK}}}, rows: [model, random]}}}}"
     (tmp_path / "own.yaml").write_text(text)
-    command = ("experiment", "own.yaml", "--seeds", "0..39")
+    command = ("experiment", "own.yaml", "--seeds", "0..19")
     made = tmp_path / "experiments" / "own"
     lines = made / "planning" / NAME / "episodes.jsonl"
     process = acwm.start(*command, cwd=tmp_path)
@@ -199,33 +200,34 @@ def test_a_run_of_one_s_own_plans_without_training(planned, acwm, tmp_path):
     process.send_signal(signal.SIGKILL)
     process.communicate()
     before = lines.read_text()
-    assert 0 < before.count("\n") < 80
+    assert 0 < before.count("\n") < 40
     _, out, _ = acwm(*command, "--plan", cwd=tmp_path)
-    assert " of 80 episodes" in out.splitlines()[0]
+    assert " of 40 episodes" in out.splitlines()[0]
     code, out, err = acwm(*command, cwd=tmp_path)
     assert code == 0, out + err
     assert out.startswith("2 of 2 steps are done\n")
     assert lines.read_text().startswith(before)
     assert sorted(episodes(lines.parent)) == [
-        (r, n) for r in ("model", "random") for n in range(40)
+        (r, n) for r in ("model", "random") for n in range(20)
     ]
     assert "<h3>Own</h3>" in (made / "report.html").read_text()
-    code, out, _ = acwm(*command[:-1], "0..40", "--plan", cwd=tmp_path)
-    assert (code, out.splitlines()[0]) == (0, "to do    plan Own · Tiny (80 of 82 episodes)")
+    code, out, _ = acwm(*command[:-1], "0..20", "--plan", cwd=tmp_path)
+    assert (code, out.splitlines()[0]) == (0, "to do    plan Own · Tiny (40 of 42 episodes)")
     code, out, _ = acwm(*command[:-1], "0..9", "--plan", cwd=tmp_path)
     assert out.splitlines()[-1] == "nothing is left to do"
 
 
-def test_results_of_other_settings_are_a_failure_with_a_name(planned, acwm, whole, tmp_path):
-    write_experiment(tmp_path, TINY, whole)
+def test_results_of_other_settings_are_a_failure_with_a_name(planned, acwm, tmp_path):
+    shutil.copytree(planned[0], tmp_path, dirs_exist_ok=True)
     made = tmp_path / "experiments" / "widths"
     results = made / "planning" / NAME
-    results.mkdir(parents=True)
+    shutil.rmtree(results)
+    results.mkdir()
     (results / "settings.json").write_text(json.dumps({"past": 7}))
     code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path)
     assert code == 1, err
     first, second, *_ = out.splitlines()
-    assert first == f"{STEPS - 1} of {STEPS} steps are done, 1 of them in earlier runs"
+    assert first == f"{STEPS - 1} of {STEPS} steps are done, {STEPS - 2} of them in earlier runs"
     assert second.startswith(f"failed: plan-{NAME}: experiments/widths/planning/{NAME} holds resul")
     assert "of another cost, " in second
     assert second.endswith(f"(see experiments/widths/logs/plan-{NAME}.log)")
