@@ -28,16 +28,16 @@ class Watch:
 
 @pytest.fixture(scope="module")
 def shared():
-    """Nine train episodes: infos, actions, and what was watched."""
+    """Five train episodes: infos, actions, and what was watched."""
     env, watch = Unseen(size=64), Watch()
-    return [play(env, index=index, look=watch)[1:] for index in range(9)], watch
+    return [play(env, index=index, look=watch)[1:] for index in range(5)], watch
 
 
 @pytest.fixture(scope="module")
 def parted():
-    """Six train episodes of the variant."""
+    """Four train episodes of the variant."""
     env, watch = Unseen8D(size=64), Watch()
-    return [play(env, index=index, look=watch)[1:] for index in range(6)], watch
+    return [play(env, index=index, look=watch)[1:] for index in range(4)], watch
 
 
 @pytest.mark.parametrize("variant", ["shared", "parted"])

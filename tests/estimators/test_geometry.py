@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from acwm_core.plugins import catalog
 from acwm_estimators.curve import same_end_first
-from acwm_estimators.layout import layout_of
-from acwm_estimators.plugin import TRAINED
-from acwm_estimators.reading import states_of
-from acwm_estimators.targets import targets_of
 from acwm_estimators.turns import decode_angle, decode_axes, encode_angle, encode_axes, upright
 from acwm_sim.camera import Camera
 from acwm_sim.geometry import outer_radius
@@ -85,27 +80,3 @@ def test_curves_keep_their_first_end_from_frame_to_frame():
     flipped = drifting.copy()
     flipped[[1, 2, 4]] = drifting[[1, 2, 4], ::-1]
     np.testing.assert_array_equal(same_end_first(flipped), drifting)
-
-
-@pytest.mark.parametrize("name", TRAINED)
-def test_what_is_asked_of_a_network_gives_the_true_states(name):
-    """Targets decode to the states that they were made of, for every field that is read."""
-    component = catalog().component("environment", name)
-    if component.missing_modules():
-        pytest.skip(f"{name} needs {component.missing_modules()}")
-    environment = component.create(size=(64, 104) if name == "push_sand" else 64)
-    _, info = environment.reset(seed=7, options={"split": "ood_test"})
-    states = {key: np.asarray(value)[None] for key, value in info["state"].items()}
-    card, layout, masks = environment.card, layout_of(name), info["mask"][None]
-    targets = targets_of(states, masks, layout, card)
-    for curve in layout.curves:  # traced, not put out by the network
-        targets[f"curve:{curve.field}"] = states[curve.field]
-    read = states_of(targets, masks, layout, card)
-    for field, found in read.items():
-        true = np.asarray(states[field], float)
-        if field in ("cube_yaw", "cube_quaternion", "board_quaternion"):
-            continue  # up to symmetries, which the tests above are about
-        seen = np.isfinite(found)
-        tolerance = 2e-4 * max(1, np.abs(true).max())
-        np.testing.assert_allclose(found[seen], true[seen], atol=tolerance, err_msg=field)
-        assert seen.any(), f"nothing of {field} is read"

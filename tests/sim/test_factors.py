@@ -1,23 +1,11 @@
-"""Factors of all worlds: what is seen of them, their labels, and values that are refused."""
+"""Values of factors that worlds refuse; that others are seen and labelled is what checks try."""
 
-import numpy as np
+import functools
+
 import pytest
 
 from acwm_core.data.simulate import make_environment
 from acwm_core.errors import RecipeError
-from tests.sim.playing import start
-
-SEEN = {
-    "push_cube": ["cube_size"],
-    "stack_cube": ["cube_size"],
-    "push_rope": ["thickness"],
-    "cloth_move": ["sphere_radius", "cloth_size"],
-    "push_sand": ["board_width"],
-    "pour_water": ["container_radius"],
-    "reacher": ["forearm_length"],
-    "robot_arm": ["obstacle_height"],
-}
-"""Continuous factors that the first frame shows, by world; it shows all discrete ones."""
 
 IMPOSSIBLE = [
     ("push_cube", {"friction": -0.1}, "give 0 to 5"),
@@ -40,27 +28,12 @@ IMPOSSIBLE = [
 ]
 
 
-@pytest.mark.parametrize("name", SEEN)
-def test_shifts_are_seen_and_labelled_and_leave_nothing_behind(name):
-    env = make_environment(name, {"size": 64})
-    plain = start(env, index=6)[0].astype(int)
-    for factor in env.card.factors:
-        if factor.kind == "discrete":
-            values, label = factor.ood, f"{factor.name}={{}}"
-        elif factor.name in SEEN[name]:
-            values, label = [factor.ood[-1][-1]], factor.name
-        else:
-            continue
-        for value in values:
-            shifted, info = start(env, index=6, **{factor.name: value})
-            assert np.abs(plain - shifted).mean() > 0.1, (factor.name, value)
-            assert info["ood_label"] == label.format(value)
-    np.testing.assert_array_equal(plain, start(env, index=6)[0])
-    env.close()
+@functools.cache
+def world(name):
+    return make_environment(name, {"size": 16})
 
 
 @pytest.mark.parametrize(("name", "factors", "sentence"), IMPOSSIBLE)
 def test_impossible_values_are_refused(name, factors, sentence):
-    environment = make_environment(name, {"size": 64})
     with pytest.raises(RecipeError, match=sentence):
-        environment.reset(options={"factors": factors})
+        world(name).reset(options={"factors": factors})
