@@ -64,8 +64,8 @@ def test_a_ranking_is_made_and_gone_on_with(mine, capsys, tmp_path, monkeypatch)
         (["place", "--device", "warp"], "warp"),
     ],
 )
-def test_bad_words_are_one_sentence(mine, capsys, words, message):
-    code, _, err = acwm(capsys, "rank", mine, *words)
+def test_bad_words_are_one_sentence(exact, capsys, words, message):
+    code, _, err = acwm(capsys, "rank", exact, *words)
     assert code == 2
     assert message in err
     assert "Traceback" not in err

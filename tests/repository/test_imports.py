@@ -20,7 +20,7 @@ MISSPELT = [
     "fit push_cube_small training.sed=3",
     "evaluate tests/reference/first_release/run evaluation.step=3",
 ]
-TOLD = ["--help", "list", "fit --help", "generate --help"]
+TOLD = ["--help", "list", "fit --help", "generate --help", "plan --help"]
 MODULES = ["recipe", "plugins", "env.environment", "env.episode", "env.task", "training.config"]
 
 
