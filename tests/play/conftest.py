@@ -1,6 +1,10 @@
+import asyncio
+
 import pytest
 
 from acwm_play import simulator
+from acwm_play.pool import WorldPool
+from acwm_play.worlds import playable
 from tests.browsing import DESK
 from tests.play import follower, scenes
 from tests.play.pages import Served, until
@@ -11,6 +15,14 @@ def run(tmp_path_factory):
     """A run of push_cube whose model follows actions; tests must not change it."""
     pytest.importorskip("mujoco", reason="needs the extra rigid")
     return follower.make_run(tmp_path_factory.mktemp("play") / "follower")
+
+
+@pytest.fixture(scope="module")
+def pool(run):
+    """What servers share: a simulator is started once."""
+    made = WorldPool(playable([run]))
+    yield made
+    asyncio.run(made.close())
 
 
 @pytest.fixture(autouse=True)

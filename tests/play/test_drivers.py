@@ -21,7 +21,7 @@ def known_drivers():
     drivers.Stuck.stopped.clear()
 
 
-def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(run, tmp_path):
+def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(pool, tmp_path):
     task = catalog().component("environment", "push_cube").load_task("place")
     goal, actions, distances = drivers.solved("push_cube", task, 3)
 
@@ -49,10 +49,10 @@ def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(run, tmp_path):
         head, *_ = await page.until(lambda found: found[0]["n"] == 4)
         assert head["progress"] is None
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_it_stops_at_once_when_the_person_takes_over_or_asks_for_a_scene(run, tmp_path):
+def test_it_stops_at_once_when_the_person_takes_over_or_asks_for_a_scene(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=5)
         await page.say("drive", by="stuck", task="place_and_turn")
@@ -78,11 +78,11 @@ def test_it_stops_at_once_when_the_person_takes_over_or_asks_for_a_scene(run, tm
         assert (await page.told("goal"))["task"] == "place_and_turn"  # it drives on in the new one
         assert page.seen["state"]["driver"] == "stuck"
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
     assert drivers.Stuck.stopped.is_set()  # also when the page has gone
 
 
-def test_when_one_fails_the_person_drives(run, tmp_path):
+def test_when_one_fails_the_person_drives(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=5)
         await page.say("drive", by="throws")
@@ -93,10 +93,10 @@ def test_when_one_fails_the_person_drives(run, tmp_path):
         await page.told("state", lambda state: state["driver"] == "you")
         await page.until(lambda found: found[0]["alone"] > 1)
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_a_pause_lets_it_think_and_a_step_takes_its_actions(run, tmp_path):
+def test_a_pause_lets_it_think_and_a_step_takes_its_actions(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)
         await page.say("pause", on=True)
@@ -109,10 +109,10 @@ def test_a_pause_lets_it_think_and_a_step_takes_its_actions(run, tmp_path):
         assert head["places"] is not None
         await page.silence()
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_the_planner_plans_with_the_model_that_is_played(run, tmp_path):
+def test_the_planner_plans_with_the_model_that_is_played(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)
         world = await page.told("world")
@@ -131,7 +131,7 @@ def test_the_planner_plans_with_the_model_that_is_played(run, tmp_path):
         head, *_ = await page.until(lambda found: found[0]["places"] not in (None, *places))
         assert head["progress"]["distance"] > 0
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
 def test_nobody_unknown_drives_and_none_in_a_world_without_tasks():

@@ -13,8 +13,6 @@ from aiohttp.test_utils import TestClient, TestServer
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_formats.check import check_dataset
 from acwm_play import serve
-from acwm_play.pool import WorldPool
-from acwm_play.worlds import playable
 
 TOKEN = "t" * 43
 
@@ -59,7 +57,7 @@ class Page:
         """Hear what is still under way, until nothing comes any more."""
         for _ in range(40):
             try:
-                await asyncio.wait_for(self.hear(), 4)
+                await asyncio.wait_for(self.hear(), 2)
             except TimeoutError:
                 return
         pytest.fail("it goes on and on")
@@ -71,19 +69,15 @@ class Page:
         return self.seen[kind]
 
 
-def played(run, out, story):
+def played(pool, out, story):
     """Run `story(page, client)` against a server of its own."""
 
     async def go():
-        pool = WorldPool(playable([run]))
         server = TestServer(serve.Server(pool, out, TOKEN).application())
-        try:
-            async with TestClient(server) as client:
-                origin = f"http://{client.host}:{client.port}"
-                async with client.ws_connect(f"/{TOKEN}/socket", origin=origin) as socket:
-                    await story(Page(socket), client)
-        finally:
-            await pool.close()
+        async with TestClient(server) as client:
+            origin = f"http://{client.host}:{client.port}"
+            async with client.ws_connect(f"/{TOKEN}/socket", origin=origin) as socket:
+                await story(Page(socket), client)
 
     asyncio.run(go())
 
@@ -103,7 +97,7 @@ def middle(mask):
     return np.array([columns.mean(), rows.mean()]) if len(rows) else np.array([np.nan, np.nan])
 
 
-def test_both_pictures_follow_the_same_actions(run, tmp_path):
+def test_both_pictures_follow_the_same_actions(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)
         head, true, seen = await page.next()
@@ -126,10 +120,10 @@ def test_both_pictures_follow_the_same_actions(run, tmp_path):
         await page.say("act", values=[-9.0, 0.0])  # out of bounds: clipped
         await page.until(lambda found: abs(white(found[2][-1])[0] / 64 - (0.5 - 0.388)) < 0.03)
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_the_model_takes_the_simulators_state_over(run, tmp_path):
+def test_the_model_takes_the_simulators_state_over(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=5)
         await page.say("point", places=[[0.2, 0.8]])
@@ -140,10 +134,10 @@ def test_the_model_takes_the_simulators_state_over(run, tmp_path):
         np.testing.assert_allclose(true.astype(int), seen, atol=1)
         assert (await page.next())[0]["alone"] == pytest.approx(0.4)
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_scenes_come_again_and_factors_shift_them(run, tmp_path):
+def test_scenes_come_again_and_factors_shift_them(pool, tmp_path):
     async def story(page, client):
         firsts = {}
         for name, wanted in {
@@ -171,10 +165,10 @@ def test_scenes_come_again_and_factors_shift_them(run, tmp_path):
         await page.told("world", lambda world: world["asked"] == {})  # the last possible one
         await page.until(lambda found: found[0]["n"] == 4)
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_pausing_stepping_and_the_policy(run, tmp_path):
+def test_pausing_stepping_and_the_policy(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=2)
         await page.until(lambda found: found[0]["n"] == 4)
@@ -195,10 +189,10 @@ def test_pausing_stepping_and_the_policy(run, tmp_path):
         assert set(figures["values"]) == {"position_error", "mask_iou"}
         assert figures["floors"]["position_error"] < 0.01
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_a_session_becomes_episodes_that_the_check_accepts(run, tmp_path):
+def test_a_session_becomes_episodes_that_the_check_accepts(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=2)
         await page.until(lambda found: found[0]["n"] == 4)
@@ -216,7 +210,7 @@ def test_a_session_becomes_episodes_that_the_check_accepts(run, tmp_path):
         await page.until(lambda found: found[0]["recorded"] > 4)
         await page.socket.close()  # a closed tab loses nothing
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
     folder = tmp_path / "push_cube-64x64"
     assert [item.problem for item in check_dataset(folder)] == [None] * 5
     episodes = [*EpisodeDataset(folder, "train")]
@@ -232,7 +226,7 @@ def test_a_session_becomes_episodes_that_the_check_accepts(run, tmp_path):
     assert np.abs(first.actions[:-1]).max() > 0
 
 
-def test_strangers_are_refused(run, tmp_path):
+def test_strangers_are_refused(pool, tmp_path):
     async def story(page, client):
         origin = f"http://{client.host}:{client.port}"
         for path in ("/", "/socket", f"/{TOKEN[:-1]}/", f"/{TOKEN}x/play.js", "/%FF/"):
@@ -254,10 +248,10 @@ def test_strangers_are_refused(run, tmp_path):
                 await client.ws_connect(where, origin=who)
             assert refused.value.status == 403
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_tabs_are_bounded_and_nonsense_ends_one_alone(run, tmp_path, monkeypatch):
+def test_tabs_are_bounded_and_nonsense_ends_one_alone(pool, tmp_path, monkeypatch):
     monkeypatch.setattr(serve, "MAX_SESSIONS", 2)
 
     async def story(page, client):
@@ -276,10 +270,10 @@ def test_tabs_are_bounded_and_nonsense_ends_one_alone(run, tmp_path, monkeypatch
             assert (await large.receive()).type in (WSMsgType.CLOSE, WSMsgType.CLOSED)
         await page.until(lambda found: found[0]["alone"] > 1)  # the first one plays on
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
 
 
-def test_a_simulator_that_is_killed_is_started_again(run, tmp_path):
+def test_a_simulator_that_is_killed_is_started_again(pool, tmp_path):
     async def story(page, client):
         import multiprocessing
 
@@ -292,4 +286,4 @@ def test_a_simulator_that_is_killed_is_started_again(run, tmp_path):
         await page.say("open", index=1)
         await page.until(lambda found: found[0]["alone"] > 1)
 
-    played(run, tmp_path, story)
+    played(pool, tmp_path, story)
