@@ -8,7 +8,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 # Tests also wait, for servers, browsers and processes; so one process more than there are cores.
 TEST_PROCESSES ?= $(shell expr $$(nproc 2>/dev/null || sysctl -n hw.ncpu) + 1)
 PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
-SELECT ?= not slow and not gpu and not browser and not documents
+SELECT ?= not slow and not gpu and not browser and not shipped
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-all lint format types lowest docs site codec-weights build clean
@@ -21,7 +21,7 @@ install: $(VENV)/installed-all  ## Install acwm with all extras and the tools of
 demo: $(VENV)/installed-rigid  ## Simulate, train, evaluate and report, at small scale
 	$(BIN)/acwm demo
 
-test: $(VENV)/installed-all  ## Run the tests, but for slow ones, a browser's and documents'
+test: $(VENV)/installed-all  ## Run the tests, but for slow ones and those that only .ci/run runs
 	$(PYTEST) -m "$(SELECT)"
 
 test-all: $(VENV)/installed-all  ## Run all tests
