@@ -98,8 +98,10 @@ def _existing_model(choice: TaskChoice, cells: Sequence[str]) -> _Model:
             f"there is no run folder, trained model or cell of this experiment {choice.model!r}"
             f"{near}"
         )
-    folder = (source if source == Path(choice.model) else copy_of(choice.model)).absolute()
-    return _Model(choice.model, source.absolute(), folder, _environment(source), choice.row)
+    given = source == Path(choice.model)
+    folder = (source if given else copy_of(choice.model)).absolute()
+    name = str(folder) if given else choice.model  # a whole path is never read as an option
+    return _Model(name, source.absolute(), folder, _environment(source), choice.row)
 
 
 def _environment(folder: Path) -> str:
