@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Literal
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,15 +18,25 @@ from acwm_core.checks.result import (
     expect_is_a,
     run_checks,
 )
-from acwm_core.checks.trial import batch_error, noise, shaken, without_gradient
+from acwm_core.checks.trial import (
+    DenoisingTrial,
+    Place,
+    PredictionTrial,
+    Probe,
+    batch_error,
+    batch_of,
+    further_inputs,
+    noise,
+    probed,
+    shaken,
+    without_gradient,
+)
 from acwm_core.errors import RecipeError
-from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import Cache, Denoiser, DynamicsModel, LatentStream, Predictor
-from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
-from acwm_core.model.objectives.flow import evaluation
-from acwm_core.model.objectives.objective import Batch, Objective
+from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.dynamics import Cache, Denoiser, DynamicsModel, Predictor
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.objectives.regression import Regression
-from acwm_core.model.shapes import Actions, Latent, Tokens
+from acwm_core.model.shapes import Latent
 
 SHAPE = (2, 4, 4, 8, 8)
 """B, L, C, h, w of the latents used in the checks."""
@@ -44,7 +54,7 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
         **params: constructor parameters, for instance a small width; not `latent_channels`.
 
     Raises:
-        RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
+        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     checks = DynamicsChecks(model, **params)
     yield from run_checks(checks)
@@ -52,44 +62,7 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
         yield from DenoiserChecks.check(model, **params)
 
 
-Place = int | Literal["input"]
-"""Where a conditioner acts: before the first layer, or after the layer of this number."""
-
-
-class Probe(Conditioner):
-    """Records where it is called, and changes the tokens at some places.
-
-    Args:
-        changed: the places where it adds something to the tokens.
-
-    Attributes:
-        called: the places where it was called, in order, each with the width of the tokens.
-    """
-
-    def __init__(self, changed: Iterable[Place] = ()) -> None:
-        super().__init__()
-        self.changed = {*changed}
-        self.called: list[tuple[Place, int]] = []
-
-    def forward(self, actions: Actions) -> Conditioning:
-        """An empty conditioning; `actions` are ignored."""
-        return Conditioning(None, None, self)
-
-    def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """Record the call."""
-        return self._act("input", tokens)
-
-    def inject(self, layer: int, tokens: Tokens, conditioning: Conditioning) -> Tokens:
-        """Record the call."""
-        return self._act(layer, tokens)
-
-    def _act(self, place: Place, tokens: Tokens) -> Tokens:
-        width = tokens.shape[-1]
-        self.called.append((place, width))
-        return tokens + noise((width,), seed=5) if place in self.changed else tokens
-
-
-class DynamicsChecks(Suite):
+class DynamicsChecks(PredictionTrial):
     """Checks of a model on random latents; weights are perturbed so that no layer is zero."""
 
     kind = "model"
@@ -102,17 +75,8 @@ class DynamicsChecks(Suite):
     def _objective(self) -> Objective[Any]:
         return DenoisingTrial(prediction="clean", steps=2) if self.is_denoiser else Regression()
 
-    def _conditioning(self, modulation: Tensor, probe: Probe | None = None) -> Conditioning:
-        return Conditioning(modulation, None, probe or Probe())
-
     def _inputs(self) -> tuple[Latent, Tensor]:
-        """Random latents `[B, L, C, h, w]` and modulation `[B, L, D]`."""
         return noise(SHAPE, seed=1), noise((*SHAPE[:2], self._model.width), seed=3)
-
-    @torch.no_grad()
-    def _predict(self, given: Latent, modulation: Tensor, probe: Probe | None = None) -> Latent:
-        batch = Batch(given, self._conditioning(modulation, probe), draws(len(given)))
-        return self._objective.predict(self._model, batch, SHAPE[1])
 
     @property
     def is_denoiser(self) -> bool:
@@ -144,10 +108,8 @@ class DynamicsChecks(Suite):
     def gradient_reaches_every_parameter(self) -> None:
         """Return a finite loss that trains all parameters, with 1 or 2 given frames."""
         latents, modulation = self._inputs()
-        conditioning, generators = self._conditioning(modulation), draws(len(latents))
         for known in (2, 1):
-            batch = Batch(latents, conditioning, generators)
-            loss = self._objective.loss(self._model, batch, known)
+            loss = self._objective.loss(self._model, batch_of(latents, modulation), known)
             expect(loss.ndim == 0 and bool(loss.isfinite()), f"the loss is {loss}")
             idle = without_gradient(self._model, loss)
             expect(not idle, f"no gradient reaches {', '.join(idle[:3])}")
@@ -162,16 +124,6 @@ class DynamicsChecks(Suite):
         expect(len({*found}) == len(found), "matrices lists a parameter twice")
         wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
         expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
-
-    def keeps_the_given_frames(self) -> None:
-        """Predict finite latents of the requested length; 1 or 2 given frames stay unchanged."""
-        latents, modulation = self._inputs()
-        for known in (1, 2):
-            given = latents[:, :known]
-            predicted = self._predict(given, modulation)
-            expect_equal("predicts", [*predicted.shape], [*SHAPE])
-            expect(predicted.isfinite().all(), "the prediction is not finite")
-            expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
 
     def elements_of_a_batch_are_independent(self) -> None:
         """Predict an element the same way whatever else is in the batch."""
@@ -230,72 +182,15 @@ class DynamicsChecks(Suite):
     def streams_what_it_predicts(self) -> None:
         """Stream finite frames (the same as predicted, unless a denoiser), or refuse to stream."""
         latents, modulation = self._inputs()
-        frames, conditioning = SHAPE[1], self._conditioning(modulation)
-        objective, model = self._objective, self._model
-        if isinstance(model, Denoiser) and model.inputs:
+        if isinstance(self._model, Denoiser) and self._model.inputs:
             raise NotTried("its further inputs come from an objective")
         for known in (1, 2):
-            given = latents[:, :known]
-            try:
-                stream = objective.stream(model, given, draws(len(given)), context=frames)
-            except RecipeError as error:
-                what = "it refuses to stream as it was trained"
-                expect(not objective.streams_by_default(model), what)
-                raise NotTried(str(error)) from None
-            expect(model.causal, "it streams, but does not say that it is causal")
-            streamed = played(stream, conditioning, known, frames)
-            predicted = self._predict(given, modulation)[:, known:]
-            expect_equal("a stream gives", [*streamed.shape], [*predicted.shape])
-            expect(streamed.isfinite().all(), "a streamed frame is not finite")
+            streamed = self._streamed(known)
+            expect(self._model.causal, "it streams, but does not say that it is causal")
+            predicted = self._predict(latents[:, :known], modulation)[:, known:]
             error = batch_error(predicted, streamed)
             what = f"after {known} given frames a stream and a prediction differ by {error:.2g}"
             expect(error < 1e-3 or self.is_denoiser, what)
-
-
-class DenoisingTrial(DiffusionForcing):
-    """Trains and samples any denoiser; its further inputs are noise that is always the same."""
-
-    causal = False
-
-    def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
-        """See `Objective.loss`."""
-        inputs = further_inputs(model, *batch.latents.shape)
-        evaluate = evaluation(model, batch.conditioning, **inputs)
-        return self.error(evaluate, batch.latents, batch.generators, known)
-
-    def predict(
-        self, model: Denoiser, given: Batch, frames: int, steps: int | None = None
-    ) -> Latent:
-        """See `Objective.predict`."""
-        batch, _, *size = given.latents.shape
-        inputs = further_inputs(model, batch, frames, *size)
-        evaluate = evaluation(model, given.conditioning, **inputs)
-        return self.sample(evaluate, given.noise(frames), given.latents, steps)
-
-
-def further_inputs(model: Denoiser, batch: int, frames: int, *size: int) -> dict[str, Tensor]:
-    """Random further inputs of a denoiser, the same for all elements of a batch."""
-    shapes = {"latent": (1, frames, *size), "level": (1, frames)}
-    drawn = {name: noise(shapes[kind], seed=6) for name, kind in model.inputs.items()}
-    return {
-        name: (each.sigmoid() if each.ndim == 2 else each).expand(batch, *each.shape[1:])
-        for name, each in drawn.items()
-    }
-
-
-def draws(batch: int, first: int = 0) -> list[torch.Generator]:
-    """A generator for each clip of a batch, seeded by its number from `first` on."""
-    return [torch.Generator().manual_seed(first + clip) for clip in range(batch)]
-
-
-@torch.no_grad()
-def played(stream: LatentStream, conditioning: Conditioning, known: int, frames: int) -> Latent:
-    """The frames of a stream after `known` given ones, up to `frames` in all."""
-    seen = [0, *range(known, frames - 1)]  # the first call covers all given frames
-    ends = range(known + 1, frames + 1)
-    return torch.cat(
-        [stream.advance(conditioning.frames(*each)) for each in zip(seen, ends, strict=True)], 1
-    )
 
 
 class DenoiserChecks(Suite):
@@ -309,7 +204,7 @@ class DenoiserChecks(Suite):
 
     def _conditioning(self, batch: int, frames: int, seed: int = 3) -> Conditioning:
         modulation = noise((batch, frames, self._model.width), seed)
-        return Conditioning(modulation, None, Probe(("input", *range(self._model.layers))))
+        return probed(modulation, Probe(("input", *range(self._model.layers))))
 
     def _inputs(
         self, batch: int = 1, frames: int = 3, height: int = 8, width: int = 8
