@@ -65,6 +65,7 @@ RENAMED = {
         "environment_card": "env.card",
         "episode": "env.episode",
         "estimator": "env.physics",
+        "evaluation.benchmark": "evaluation.protocol",
         "hooks": "plugins",
         "metric": "evaluation.metric",
         "planning.task": "env.task",

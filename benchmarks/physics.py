@@ -20,10 +20,9 @@ from rich.table import Table
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
-from acwm_core.evaluation.metric import Metric
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
-from acwm_metrics.calibrate import true_prediction
 from acwm_metrics.plugin import PHYSICS
 
 
@@ -51,7 +50,7 @@ def row(folder: Path, split: Split, metrics: dict[str, Metric], clips: int) -> l
     reading = measuring = 0.0
     count = min(clips, len(episodes))
     for index in range(count):
-        prediction = true_prediction(episodes[index], card, estimator)
+        prediction = Prediction.truth(episodes[index], card, estimator)
         started = time.process_time()
         _ = prediction.observed
         read = time.process_time()

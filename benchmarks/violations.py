@@ -24,7 +24,6 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.score import estimator_for
-from acwm_metrics.calibrate import true_prediction
 from acwm_metrics.conservation import violations
 
 TRUE = "nothing (false alarms)"
@@ -61,7 +60,7 @@ def checked(world: str, clips: int, size: int, frames: int) -> Iterator[tuple[st
         split = "ood_test" if index % 2 else "ind_test"
         spec = EpisodeSpec(world, split, index, seed=977, options={"size": size})
         true = simulate(environment, spec, frames=frames or None)
-        prediction = true_prediction(true, environment.card, estimator)
+        prediction = Prediction.truth(true, environment.card, estimator)
         yield TRUE, _found(prediction)
         for name, fault in FAULTS[world].items():
             at = len(true.video) // 3

@@ -21,6 +21,7 @@ from acwm_core.env.physics import (
     StateEstimator,
     States,
 )
+from acwm_core.errors import ShapeError
 from acwm_core.model.shapes import Clip
 
 RADIUS = 0.1  # in m; a frame is 1 m high
@@ -118,6 +119,8 @@ class DiscEstimator(StateEstimator):
 
     def estimate(self, video: Clip) -> Observation:
         """Masks, and the centre of the disc's pixels; NaN where there are none."""
+        if tuple(video.shape[2:]) != self.card.frame_size:
+            raise ShapeError(f"frames are {[*video.shape[2:]]}, not {self.card.frame_size}")
         red = avg_pool2d(video[:, 0] - video[:, 1], 5, 1, 2, count_include_pad=False).numpy()
         masks = (red > 0.35).astype(np.uint8)  # the value at the disc's edge
         rows, columns = np.indices(masks.shape[1:]) + 0.5

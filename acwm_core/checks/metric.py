@@ -19,7 +19,6 @@ from acwm_core.checks.trial import EnvironmentTrial
 from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.metric import Metric, Prediction, Reads, SetMetric
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.model.shapes import Clip
@@ -101,8 +100,8 @@ class MetricChecks(Suite):
     def _simulated(self, actions: NDArray[np.float32]) -> Prediction:
         trial = self._environment
         episode = simulate(trial.environment, trial.spec(), actions, frames=len(actions))
-        video = as_clip(episode.video)
-        return Prediction.of(episode, video.clone(), video, trial.card, self._estimator)
+        truth = Prediction.truth(episode, trial.card, self._estimator)
+        return replace(truth, video=truth.target.clone())
 
     def _predicted(self, predict: Callable[[Clip], Clip]) -> Prediction:
         """The same clip and branch, with predictions computed from the truth by `predict`."""

@@ -52,9 +52,6 @@ def check_model(model: str | Callable[..., DynamicsModel], **params: Any) -> Ite
     Args:
         model: a registered name, or the class.
         **params: constructor parameters, for instance a small width; not `latent_channels`.
-
-    Raises:
-        UnknownNameError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     checks = DynamicsChecks(model, **params)
     yield from run_checks(checks)

@@ -108,8 +108,5 @@ class Suite:
             *args: for suites that take it, what the component is checked on: a registered name, or
                 the class.
             **params: constructor parameters, for instance a small width.
-
-        Raises:
-            RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
         """
         return run_checks(cls(component, *args, **params))

@@ -25,9 +25,6 @@ def check_task(name: str) -> Iterator[CheckResult]:
 
     Args:
         name: ``ENVIRONMENT.TASK``.
-
-    Raises:
-        RecipeError, MissingExtraError, PluginError: the name cannot be resolved.
     """
     catalog().component("task", name)
     environment, _, task = name.partition(".")

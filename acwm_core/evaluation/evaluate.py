@@ -20,11 +20,11 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
 from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.protocol import published_for
 from acwm_core.evaluation.provenance import provenance
 from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary
@@ -75,12 +75,6 @@ def evaluate_run(
 
     Returns:
         The content of ``summary.json``.
-
-    Raises:
-        TrainingError: the folder holds no trained run.
-        DataError: the dataset is missing, unfinished or of another environment; there is a result
-            made with other settings; another command is evaluating the run.
-        RecipeError: an override is wrong, or changes another section.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -120,10 +114,10 @@ def _evaluate(
         for split, each in datasets.items()
     }
     total = sum(evaluator.count_rows(each) for each in clips.values())
-    with progress_bar(evaluator, total + units_of_work(evaluator, clips), progress) as told:
-        scores = {s: scores_with_references(told, clips[s], datasets[s]) for s in datasets}
-        sweeps = {s: told.sweep(clips[s], datasets[s]) for s in datasets}
-        found = intervene(told, clips, datasets)
+    with progress_bar(evaluator, total + units_of_work(evaluator, clips), progress) as shown:
+        scores = {s: scores_with_references(shown, clips[s], datasets[s]) for s in datasets}
+        sweeps = {s: shown.sweep(clips[s], datasets[s]) for s in datasets}
+        found = intervene(shown, clips, datasets)
     videos = [v for s in datasets for v in evaluator.videos(clips[s], datasets[s], scores[s])]
     videos += found.videos
     scores = {split: [*each, *found.scores.get(split, ())] for split, each in scores.items()}

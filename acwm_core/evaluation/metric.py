@@ -17,7 +17,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import PluginError, ShapeError, check_shape, noting
-from acwm_core.evaluation.clips import Clip, Predictor
+from acwm_core.evaluation.clips import Clip, Predictor, as_clip
 from acwm_core.renamed import RenamedWarning
 
 if TYPE_CHECKING:
@@ -74,6 +74,19 @@ class Prediction:
         """A prediction of an episode, whose own video as a tensor is `target`."""
         truth = episode.actions, episode.states, episode.masks, episode.contacts
         return cls(video, target, *truth, card, estimator, ood_label=episode.ood_label)
+
+    @classmethod
+    def truth(
+        cls,
+        episode: Episode,
+        card: EnvironmentCard,
+        estimator: StateEstimator | None = None,
+        clip: Clip | None = None,
+    ) -> Prediction:
+        """An episode's own video, as a prediction of itself."""
+        video = as_clip(episode.video)
+        made = cls.of(episode, video, video, card, estimator)
+        return replace(made, clip=clip or made.clip, kind="truth")
 
     def without(self, frames: int) -> Prediction:
         """The prediction without its first `frames` frames, as if the clip had begun later."""

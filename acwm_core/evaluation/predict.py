@@ -19,7 +19,6 @@ from acwm_core.evaluation.clips import (
     PREDICTORS,
     Clip,
     Predictor,
-    as_clip,
     donor_actions,
     read_clips,
 )
@@ -89,9 +88,7 @@ class Evaluator:
     def truths(self, clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[Prediction]:
         """The true video of each clip, as a prediction of itself."""
         for clip, episode in read_clips(clips, episodes):
-            video = as_clip(episode.video)
-            truth = Prediction.of(episode, video, video, self.card, self.estimator)
-            yield replace(truth, clip=clip, kind="truth")
+            yield Prediction.truth(episode, self.card, self.estimator, clip)
 
     def predict(
         self,

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from pydantic import AliasChoices, Field
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.benchmark import Published
 from acwm_core.evaluation.metric import MetricInfo as MetricInfo
+from acwm_core.evaluation.protocol import Published
 from acwm_core.evaluation.statistics import Estimate as Estimate
 from acwm_core.evaluation.statistics import Paired as Paired
 from acwm_core.evaluation.statistics import defined as defined

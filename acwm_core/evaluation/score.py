@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,11 +48,6 @@ def _build(config: MetricConfig) -> Metric:
     if not isinstance(metric, Metric):
         made = type(metric).__name__
         raise PluginError(f"metric {config.component!r} makes a {made}, which is not a Metric")
-    texts = (metric.name, metric.title, metric.unit, metric.group)
-    if not all(isinstance(cast(object, each), str) for each in texts):
-        raise PluginError(
-            f"name, title, unit and group of metric {config.component!r} must be text"
-        )
     if config.name not in (metric.name, config.component):
         rest = config.name.removeprefix(f"{metric.name}_")  # ``lpips_vgg`` gives ``LPIPS vgg``
         title, words = metric.info.title, rest.replace("_", " ")

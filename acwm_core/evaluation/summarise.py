@@ -92,7 +92,7 @@ def _compared(
 def gap(
     inside: Sequence[Score], outside: Sequence[Score], metrics: Metrics, seed: int
 ) -> dict[str, dict[str, Estimate]]:
-    """SetSummary out of distribution minus those in distribution, by row and metric."""
+    """The scores out of distribution minus those in distribution, by row and metric."""
     near, far = tabulate(inside, metrics), tabulate(outside, metrics)
     return {
         kind: {name: gap_between(near[kind][name], far[kind][name], seed) for name in metrics}
@@ -112,7 +112,7 @@ def horizon(results: Sequence[Score], metrics: Metrics) -> dict[str, dict[str, l
 
 
 def tabulate(results: Sequence[Score], metrics: Metrics) -> dict[str, dict[str, ClipScores]]:
-    """SetSummary as arrays by row and metric, with clips sorted by episode and start."""
+    """Scores as arrays by row and metric, with clips sorted by episode and start."""
     ordered = sorted(results, key=lambda r: (r.episode, r.start))
     return {
         kind: {

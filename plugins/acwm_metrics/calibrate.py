@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.episode import Episode, Split
-from acwm_core.env.physics import Gap, StateEstimator
-from acwm_core.evaluation.clips import as_clip
+from acwm_core.env.episode import Split
+from acwm_core.env.physics import Gap
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.plugins import catalog
 from acwm_metrics.conservation import LASTING, change
@@ -127,21 +125,13 @@ def f1_score(pairs: Sequence[tuple[Signal, NDArray[np.bool_]]], touch: float) ->
     return 2 * right / max(found + true, 1)
 
 
-def true_prediction(
-    episode: Episode, card: EnvironmentCard, estimator: StateEstimator
-) -> Prediction:
-    """Use an episode's own video as its prediction."""
-    video = as_clip(episode.video)
-    return Prediction.of(episode, video, video, card, estimator)
-
-
 def _predictions(folder: Path, most: int) -> Iterator[Prediction]:
     card = DatasetCard.read(folder)
     estimator = catalog().create("estimator", card.environment.name, card=card.environment)
     for split in card.splits:
         episodes = EpisodeDataset(folder, cast(Split, split))
         for index in range(min(most, len(episodes))):
-            yield true_prediction(episodes[index], card.environment, estimator)
+            yield Prediction.truth(episodes[index], card.environment, estimator)
 
 
 def main() -> None:

@@ -36,7 +36,6 @@ class Permanence(PhysicalMetric):
     higher_is_better = True
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs objects."""
         return None if physics.objects else "no objects to track"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -55,7 +54,6 @@ class LengthError(PhysicalMetric):
     kind: Literal["length", "amount"] = "length"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs conserved lengths (or amounts)."""
         return None if _of(physics, self.kind) else f"no {self.kind} that is conserved"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -78,7 +76,6 @@ class Penetration(PhysicalMetric):
     unit = "m"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs solid bodies that can meet."""
         solid = any(gap.solid is not None for gap in physics.gaps)
         return None if solid else "no two solid bodies whose distance is read"
 
@@ -104,7 +101,6 @@ class Violations(PhysicalMetric):
     bounds = (0.0, 1.0)
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs something that is conserved."""
         some = (
             physics.objects or physics.constants or any(g.solid is not None for g in physics.gaps)
         )

@@ -46,7 +46,6 @@ class ContactMetric(PhysicalMetric):
     group = "Contacts"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs contacts that can be detected."""
         told = any(gap.touch is not None for gap in physics.gaps)
         return None if told else "no contacts that can be detected"
 

@@ -13,12 +13,12 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from acwm_core.data.shards import file_sha256
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
 from acwm_core.evaluation.metric import Prediction, SetMetric
 from acwm_core.model.shapes import Clip
-from acwm_metrics.networks import fingerprint
 
 SIDE = 224
 """Frames are resized to squares of this side, on which the network was trained."""
@@ -37,9 +37,6 @@ class FVD(SetMetric):
     Args:
         detector: the TorchScript file ``i3d_torchscript.pt`` of StyleGAN-V. A TorchScript file is
             a program: only use a file that you trust.
-
-    Raises:
-        DataError: the file is missing or is not TorchScript.
     """
 
     name = "fvd"
@@ -62,7 +59,7 @@ class FVD(SetMetric):
 
     def provenance(self) -> Mapping[str, str]:
         """The hash of the detector file."""
-        return {"detector": fingerprint(self.file)} if self.file else {}
+        return {"detector": file_sha256(self.file)} if self.file else {}
 
     def features(self, prediction: Prediction) -> NDArray[np.float32]:
         """Features of prediction and target, `[2, D]`."""

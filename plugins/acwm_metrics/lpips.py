@@ -15,11 +15,12 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from acwm_core.data.shards import file_sha256
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import DataError
 from acwm_core.evaluation.metric import Metric, Prediction
-from acwm_metrics.networks import fingerprint, read_tensors
+from acwm_metrics.networks import read_tensors
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Shift and scale of pixels in [-1, 1], per channel."""
@@ -95,9 +96,6 @@ class LPIPS(Metric):
             ``.safetensors``.
         heads: file with channel weights; by default those of LPIPS 0.1, which come with
             torchmetrics.
-
-    Raises:
-        DataError: a file is missing, or holds other weights.
     """
 
     name = "lpips"
@@ -143,7 +141,7 @@ class LPIPS(Metric):
         """The name of the network and the hashes of its files."""
         if self.backbone is None:
             return {"network": self.network}
-        hashes = {"backbone": fingerprint(self.backbone), "heads": fingerprint(self.heads)}
+        hashes = {"backbone": file_sha256(self.backbone), "heads": file_sha256(self.heads)}
         return {"network": self.network, **hashes}
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ class PositionError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs positions."""
         return None if _of(physics, "position", "curve") else "no position that is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -51,7 +50,6 @@ class OrientationError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs angles or orientations."""
         return None if _of(physics, "angle", "quaternion") else "no angle that is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:

@@ -56,11 +56,7 @@ class Response(Metric):
 
 
 def response_sums(prediction: Prediction) -> tuple[Sums, Sums]:
-    """Σ|Δ − Δ*|² and Σ|Δ*|² of each frame over all branches.
-
-    Raises:
-        ShapeError: prediction and target of the clip or a branch differ in shape.
-    """
+    """Σ|Δ − Δ*|² and Σ|Δ*|² of each frame over all branches."""
     predicted, true = videos(prediction)
     errors, energy = np.zeros(len(true)), np.zeros(len(true))
     for branch in prediction.branches:

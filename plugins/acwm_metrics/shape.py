@@ -37,7 +37,6 @@ class MaskIoU(PhysicalMetric):
     title = "Mask IoU"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs masks."""
         return None if physics.objects or physics.shapes else "no instances whose masks are read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -64,7 +63,6 @@ class OutlineError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs instances with a shape instead of a pose."""
         return None if physics.shapes else "nothing that changes its shape"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
@@ -87,7 +85,6 @@ class HeightError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        """See `PhysicalMetric.lacking`: it needs surfaces whose height is read."""
         return None if physics.levels else "no surface whose height is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:

@@ -126,10 +126,6 @@ def as_torchmetric(
         card: card of the environment; needed by metrics that read states.
         estimator: reads states from video; needed by metrics that read states.
         **params: constructor parameters, if `metric` is a name.
-
-    Raises:
-        RecipeError, MissingExtraError: the metric, or something that it needs, is missing.
-        PluginError: the metric needs a card or an estimator that is not given.
     """
     made = catalog().create("metric", metric, **params) if isinstance(metric, str) else metric
     return RolloutMetric(made, card, estimator)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acwm_core.evaluation.protocol import Protocol
+from acwm_core.evaluation.protocol import Protocol, PublishedTable
 
 if TYPE_CHECKING:
-    from acwm_core.evaluation.benchmark import PublishedTable
     from acwm_core.evaluation.config import EvaluationConfig
 
 DRAW_SEED = 0

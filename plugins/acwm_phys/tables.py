@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from acwm_core.evaluation.benchmark import PublishedRow, PublishedTable
+from acwm_core.evaluation.protocol import PublishedRow, PublishedTable
 
 PROTOCOL = "acwm-phys"
 

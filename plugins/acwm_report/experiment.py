@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.benchmark import published_tables
+from acwm_core.evaluation.protocol import published_tables
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.statistics import ClipScores
 from acwm_core.evaluation.storage import read_scores

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
+from acwm_core.files import inside
 from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
@@ -79,13 +80,12 @@ def collect(folder: Path) -> Collection:
     for path in sorted(folder.rglob(SUMMARY)):
         if path.parts[-3] == PLANS:  # a table of plans; it is read with its run
             continue
+        file = str(path.relative_to(folder))
         run = path.parent.parent if path.parent.name == FOLDER else path.parent
-        inside = run != folder and run.is_relative_to(folder)
-        name = str(run.relative_to(folder)) if inside else folder.resolve().name
+        below = run != folder and run.is_relative_to(folder)
+        name = str(run.relative_to(folder)) if below else folder.resolve().name
         try:
-            if not path.resolve().is_relative_to(folder.resolve()):
-                raise DataError(f"{path} is a link that leads out of {folder}")
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            digest = file_sha256(inside(folder, file))
             if digest in seen:
                 found.copies += 1
                 continue
@@ -93,14 +93,12 @@ def collect(folder: Path) -> Collection:
             summary = replace(summary, metrics=described(summary.metrics))
             boards_of({name: summary})  # old files may lack what it needs
         except KeyError as error:
-            found.broken[str(path.relative_to(folder))] = f"it lacks {error}"
+            found.broken[file] = f"it lacks {error}"
         except DAMAGE as error:
-            why = str(error).partition(" is ")[2] or str(error)  # without its path
-            found.broken[str(path.relative_to(folder))] = why
+            found.broken[file] = str(error).removeprefix(f"{path} ").removeprefix("is ")
         else:
             seen.add(digest)
-            taken = name in found.entries  # a run folder may hold two files
-            label = str(path.relative_to(folder)) if taken else name
+            label = file if name in found.entries else name  # a run folder may hold two files
             found.entries[label] = summary
             _add_uses(found, label, run, summary)
     return found

@@ -73,9 +73,6 @@ def write_report(
 
     Returns:
         The path of the file.
-
-    Raises:
-        DataError: no run was given, none is readable, or `out` cannot be written.
     """
     folders = _checked(runs, experiment)
     out = writable(Path(out) if out else folders[0] / "report.html")
@@ -125,9 +122,6 @@ def export_report(
 
     Returns:
         The paths of the files.
-
-    Raises:
-        DataError: no run was given, none is readable, or `folder` cannot be written.
     """
     folder = Path(folder)
     for name in ("tables", "figures"):
@@ -189,11 +183,7 @@ def _differences(runs: Sequence[EvaluatedRun]) -> Table | str | None:
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
-    """Write a page, completely or not at all. Everything that it shows is escaped.
-
-    Raises:
-        DataError: the page cannot be written there.
-    """
+    """Write a page, completely or not at all. Everything that it shows is escaped."""
     return _write_text(writable(path), drawn_page(template, **content))
 
 

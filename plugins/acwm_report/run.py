@@ -13,6 +13,7 @@ from jinja2 import TemplateError
 from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.evaluation.results import Estimate, MetricInfo, Score, SetSummary, Summary
 from acwm_core.evaluation.storage import read_scores
+from acwm_core.files import inside
 from acwm_core.plugins import catalog
 from acwm_report.table import Scale
 from acwm_report.titles import OVER
@@ -121,16 +122,8 @@ def of_readable(
 
 
 def result_files(run: Path, pattern: str) -> list[Path]:
-    """The files of a run folder that match `pattern`, sorted.
-
-    Raises:
-        DataError: a file is a link that leads out of the run folder.
-    """
-    files = sorted(run.glob(pattern))
-    for file in files:
-        if not file.resolve().is_relative_to(run.resolve()):
-            raise DataError(f"{file} is a link that leads out of {run}")
-    return files
+    """The files of a run folder that match `pattern`, sorted; no link may lead out of it."""
+    return [inside(run, str(file.relative_to(run))) for file in sorted(run.glob(pattern))]
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[EvaluatedRun]:

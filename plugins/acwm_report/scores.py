@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from acwm_core.evaluation.benchmark import PublishedRow
+from acwm_core.evaluation.protocol import PublishedRow
 from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import Cell, Column, Row, Scale, Table

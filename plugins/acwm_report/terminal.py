@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from acwm_core.evaluation.benchmark import PublishedRow
+    from acwm_core.evaluation.protocol import PublishedRow
     from acwm_core.evaluation.results import Counterfactual, Estimate, SetSummary, Summary
     from acwm_report.comparison import Comparison, Difference
     from acwm_severity.curves import SeverityCurve
@@ -164,7 +164,7 @@ def _published_table(summary: Summary, row: PublishedRow) -> Table:
 
 def about_published(summary: Summary) -> str:
     """Where the published figures of a run come from and how far they are comparable, as text."""
-    from acwm_core.evaluation.benchmark import published_tables
+    from acwm_core.evaluation.protocol import published_tables
 
     if not summary.published:
         return ""

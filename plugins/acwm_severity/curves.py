@@ -45,7 +45,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SeverityPoint:
-    """SetSummary at one value of the factor.
+    """The scores at one value of the factor.
 
     Attributes:
         value: value of the factor in all episodes.

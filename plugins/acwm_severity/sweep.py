@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.remote import data_folder
-from acwm_core.env.episode import EpisodeSpec, Factor, FactorValue, Split
+from acwm_core.env.episode import EpisodeSpec, Factor, Split
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
 from acwm_core.evaluation.interventions import simulator_of
+from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.provenance import provenance
-from acwm_core.evaluation.results import SetSummary, write_json
+from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.storage import refuse_other_result
 from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run_folder import RunFolder, run_to_write
@@ -61,12 +62,6 @@ def sweep_severity(
 
     Returns:
         An iterator with one curve per text, computed on demand; all texts are checked first.
-
-    Raises:
-        TrainingError: the folder holds no trained run.
-        RecipeError: no such factor or value, a factor twice, or an override is wrong.
-        DataError: the simulator is not available; a folder holds other data; or there is a curve
-            made with other settings, or at values that would be lost.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
@@ -80,29 +75,19 @@ def sweep_severity(
         refuse_other_result(home / f"{sweep.factor.name}.json", evaluator.config, values)
 
     def curve(sweep: Sweep) -> SeverityCurve:
-        config, count = evaluator.config, evaluator.config.severity_episodes
+        factor, count = sweep.factor, evaluator.config.severity_episodes
         datasets = _generated(card, sweep, home / f"{count}-episodes", count, workers, progress)
-        rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
-        given = evaluator.given
-        plans = {n: plan_clips(SPLIT, d.lengths, config, given) for n, d in datasets.items()}
-        points: list[SeverityPoint] = []
-        total = sum(evaluator.count_rows(each, rows) for each in plans.values())
-        with progress_bar(evaluator, total, progress) as told:
-            for value, (name, episodes) in zip(sweep.values, datasets.items(), strict=True):
-                results = told.scores(plans[name], episodes, rows)
-                scores = summarise(results, evaluator.metrics, config.seed)
-                points.append(_point(sweep.factor, value, scores, episodes))
         made = SeverityCurve(
-            factor=sweep.factor.name,
-            description=sweep.factor.description,
-            unit=sweep.factor.unit,
-            kind=sweep.factor.kind,
-            train=list(sweep.factor.train),
-            ood=list(sweep.factor.ood),
+            factor=factor.name,
+            description=factor.description,
+            unit=factor.unit,
+            kind=factor.kind,
+            train=list(factor.train),
+            ood=list(factor.ood),
             episodes=count,
             metrics={n: m.info for n, m in evaluator.metrics.items()},
             headline=evaluator.headline,
-            points=points,
+            points=_points(evaluator, sweep, datasets, progress),
             left_out=list(sweep.left_out),
             provenance=provenance(folder, recipe, evaluator, datasets),
         )
@@ -112,11 +97,22 @@ def sweep_severity(
     return map(curve, sweeps)
 
 
-def _point(
-    factor: Factor, value: FactorValue, scores: SetSummary, episodes: EpisodeDataset
-) -> SeverityPoint:
-    level = factor.severity(value)
-    return SeverityPoint(value, level, level == 0, scores, episodes.checksum)
+def _points(
+    evaluator: Evaluator, sweep: Sweep, datasets: Mapping[str, EpisodeDataset], progress: bool
+) -> list[SeverityPoint]:
+    """Score the model at every value; `datasets` hold its episodes, in the order of the values."""
+    config, factor = evaluator.config, sweep.factor
+    rows: list[Predictor] = [each for each in evaluator.predictors if each != "shuffled"]
+    plans = [plan_clips(SPLIT, d.lengths, config, evaluator.given) for d in datasets.values()]
+    total = sum(evaluator.count_rows(each, rows) for each in plans)
+    points: list[SeverityPoint] = []
+    with progress_bar(evaluator, total, progress) as shown:
+        for value, clips, episodes in zip(sweep.values, plans, datasets.values(), strict=True):
+            scores = shown.scores(clips, episodes, rows)
+            found = summarise(scores, evaluator.metrics, config.seed)
+            level = factor.severity(value)
+            points.append(SeverityPoint(value, level, level == 0, found, episodes.checksum))
+    return points
 
 
 def _generated(

@@ -6,45 +6,21 @@ import numpy as np
 import pytest
 
 from acwm_core.checks import check_estimator
-from acwm_core.checks.disc import RADIUS, Disc
+from acwm_core.checks.disc import RADIUS, Disc, DiscEstimator
 from acwm_core.checks.estimator import EstimatorChecks
 from acwm_core.checks.result import checks_of
-from acwm_core.env.physics import Observation, Physics, Reading, StateEstimator
-from acwm_core.errors import ShapeError
+from acwm_core.env.physics import Physics, Reading
 from tests.checks.results import Flaws, failures
 
 FLAWS = Flaws(check_estimator, checks_of(EstimatorChecks), Disc)
 
 
-class DiscEstimator(StateEstimator):
-    """Red pixels are the disc, and their middle is its position."""
-
-    fields = ("position",)
-    instances = ("disc",)
-
-    @property
-    def physics(self):
-        return Physics(readings=(Reading("position", "position", ("disc",)),))
+class Misplaced(DiscEstimator):
+    """Reads other positions than it should."""
 
     def estimate(self, video):
-        if tuple(video.shape[2:]) != self.card.frame_size:
-            raise ShapeError("frames of another size")
-        frames = video.numpy()
-        masks = (frames[:, 0] - frames[:, 1] > 0.35).astype(np.uint8)
-        return Observation(masks, {"position": self.middles(masks)})
-
-    def middles(self, masks):
-        height, width = masks.shape[1:]
-        found = np.full((len(masks), 2), np.nan, np.float32)
-        for frame, mask in enumerate(masks):
-            y, x = np.nonzero(mask)
-            if len(x):
-                found[frame] = (x.mean() + 0.5 - width / 2), (y.mean() + 0.5 - height / 2)
-        return found / height
-
-    def pixels(self, field, values):
-        height, width = self.card.frame_size
-        return np.asarray(values) * height + np.array([width, height]) / 2
+        seen = super().estimate(video)
+        return replace(seen, states={**seen.states, "position": self.off(seen.states["position"])})
 
 
 def test_a_sound_estimator_passes():
@@ -60,14 +36,14 @@ class OneMask(DiscEstimator):
 
 
 @FLAWS.caught_by("reads a clip", "is infinite")
-class Infinite(DiscEstimator):
-    def middles(self, masks):
-        return super().middles(masks) / 0
+class Infinite(Misplaced):
+    def off(self, position):
+        return position / 0
 
 
 @FLAWS.caught_by("says what it reads", "lists the fields")
 class SaysMore(DiscEstimator):
-    fields = ("position", "velocity")
+    fields = ("position", "bearing", "velocity")
 
 
 @FLAWS.caught_by("says what it reads", "which is not read")
@@ -85,9 +61,9 @@ class SeesShadows(DiscEstimator):
 
 
 @FLAWS.caught_by("follows what moves", "is off by")
-class Sluggish(DiscEstimator):
-    def middles(self, masks):
-        return np.zeros_like(super().middles(masks)) + 0.3
+class Sluggish(Misplaced):
+    def off(self, position):
+        return np.zeros_like(position) + 0.3
 
 
 @FLAWS.caught_by("shows positions in the frame", "far out of the frame")
@@ -112,9 +88,9 @@ class InPlace(DiscEstimator):
 
 
 @FLAWS.caught_by("reading repeats and leaves no trace", "second reading of 'position'")
-class Random(DiscEstimator):
-    def middles(self, masks):
-        return super().middles(masks) + 1e-3 * np.random.default_rng().random()
+class Random(Misplaced):
+    def off(self, position):
+        return position + 1e-3 * np.random.default_rng().random()
 
 
 def test_a_class_needs_an_environment():

@@ -6,12 +6,9 @@ import torch
 from acwm_core.checks import check_conditioner, check_model
 from acwm_core.errors import RecipeError
 from acwm_core.model.build import build_conditioner, build_world_model
-from acwm_core.model.objectives.full_sequence import FullSequence
-from acwm_core.model.objectives.objective import Batch
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, compose
 from acwm_dit.cross_attention import CrossAttention
-from acwm_dit.dit import DiT
 from tests.checks.results import failures
 from tests.checks.toys import AtTheInput, SmallUNet, ToysPlugin
 from tests.core.test_assembly import CARD
@@ -39,30 +36,6 @@ def test_a_model_of_two_widths_conforms():
 
 def test_a_conditioner_that_acts_at_the_input_alone_conforms():
     assert failures(check_conditioner(AtTheInput)) == {}
-
-
-@pytest.mark.parametrize("conditioner", ["adaln", "cross_attention", "toy_input"])
-@pytest.mark.parametrize("network", [SmallUNet, DiT])
-def test_actions_reach_the_prediction_and_train_what_embeds_them(network, conditioner):
-    torch.manual_seed(0)
-    model = network(latent_channels=4)
-    objective = FullSequence(prediction="clean", steps=2)
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)
-    embed = fitted(conditioner, model)
-    latents, actions = torch.randn(1, 3, 4, 8, 8), torch.rand(2, 9, 2)
-    one, other = (
-        objective.predict(
-            model, Batch(latents[:, :1], embed(rows[None]), [torch.Generator().manual_seed(0)]), 3
-        )
-        for rows in actions
-    )
-    assert not torch.allclose(one[:, 1:], other[:, 1:])
-    draws = [torch.Generator().manual_seed(0)]
-    objective.loss(model, Batch(latents, embed(actions[:1]), draws), 1).backward()
-    idle = {name for name, parameter in embed.named_parameters() if not parameter.grad.any()}
-    # Attention to a single action token does not depend on the query.
-    assert {name for name in idle if "query" not in name and "norm_tokens" not in name} == set()
 
 
 def test_cross_attention_is_as_wide_as_each_layer():

@@ -76,16 +76,6 @@ def test_generate_names_part_episode_and_line(name, told, at, tmp_path, monkeypa
         assert f"({line(at)}); --traceback shows all of it" in said
 
 
-@pytest.mark.parametrize(("name", "told", "at"), ENVIRONMENTS)
-def test_check_does_too(name, told, at, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    result = run("check", name)
-    assert result.exit_code in (1, 2)
-    assert "Traceback" not in result.output
-    assert told in result.output
-    assert not at or f"({line(at)})" in result.output
-
-
 def test_a_worker_names_it_as_well(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     words = ["generate", "raising_world", "--episodes", "1,1,1", "--workers", "1"]

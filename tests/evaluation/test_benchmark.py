@@ -8,9 +8,14 @@ from click.testing import CliRunner
 
 from acwm_core.cli.main import main
 from acwm_core.errors import PluginError, RecipeError
-from acwm_core.evaluation.benchmark import PublishedRow, PublishedTable, published_for
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.protocol import Protocol, protocol_named
+from acwm_core.evaluation.protocol import (
+    Protocol,
+    PublishedRow,
+    PublishedTable,
+    protocol_named,
+    published_for,
+)
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import Catalog, hookimpl
@@ -50,8 +55,7 @@ def benchmark(monkeypatch):
     """A catalog with that plugin and no other protocol or table."""
     catalog = Catalog()
     catalog.add_plugin(Benchmark, "benchmark")
-    for module in ("benchmark", "protocol"):
-        monkeypatch.setattr(f"acwm_core.evaluation.{module}.catalog", lambda: catalog)
+    monkeypatch.setattr("acwm_core.evaluation.protocol.catalog", lambda: catalog)
 
 
 def test_a_foreign_protocol_and_table_are_evaluated_with(benchmark, data, tmp_path):

@@ -11,22 +11,26 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Clip, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.interventions import (
+from acwm_core.evaluation.counterfactual import (
     SIZES,
-    asked_clips,
+    counterfactual,
     max_branches,
     plan_branches,
     simulate_branches,
 )
+from acwm_core.evaluation.interventions import asked_clips
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.responses import counterfactual
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.score import build_metrics
 from acwm_metrics.response import Response
 
 FRAMES, CLIPS = 10, 2
 KINDS = ["another", "still", "reversed", "mirrored", "vx", "vy"]
+
+
+SIMULATED = {}
+"""Clips of `Disc`, by frame size, seed and actions."""
 
 
 class Episodes(list):
@@ -48,13 +52,12 @@ class Known:
 
     def __init__(self, environment, specs, predict):
         self.environment, self.specs, self.predict = environment, specs, predict
-        self.asked = []
+        self.factual = {}  # the first actions of each seed
 
     def rollout_chunks(self, given, actions, *, mode, steps, seeds):
         videos = []
         for rows, seed in zip(actions.numpy(), seeds, strict=True):
-            self.asked.append((seed, rows))
-            factual = next(own for other, own in self.asked if other == seed)
+            factual = self.factual.setdefault(seed, rows)
             true, usual = (self._true(seed, each) for each in (rows, factual))
             videos.append(self.predict(usual, true, seed))
         yield torch.stack(videos)
@@ -66,7 +69,11 @@ class Known:
         return video * 0.5 + 0.25
 
     def _true(self, seed, rows):
-        return as_clip(simulate(self.environment, self.specs[seed], rows, frames=len(rows)).video)
+        key = self.environment.frame_size, seed, rows.tobytes()
+        if key not in SIMULATED:
+            made = simulate(self.environment, self.specs[seed], rows, frames=len(rows))
+            SIMULATED[key] = as_clip(made.video)
+        return SIMULATED[key]
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
-from acwm_core.evaluation.clips import derangement, noise_seed, plan_clips
+from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import choose_device, evaluate_run
 from acwm_core.evaluation.interventions import Interventions
@@ -20,36 +20,24 @@ from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from tests import tiny
+from tests.evaluation.by_hand import predictions, squared_error
+
+FEW = {"counterfactual_metrics": [], "perturbed_episodes": 0, "metrics": ["mse"], "videos": 0}
+"""Settings of evaluations of which little is asked."""
 
 
 def by_hand(run, data, split):
-    """MSE and SSIM of every row, predicted one clip at a time without the evaluation's code."""
-    world_model = load_run(run).world_model
-    episodes = list(EpisodeDataset(data, split))
-    donors = derangement(len(episodes), 0)
+    """MSE and SSIM of every row, predicted one clip at a time."""
+    world_model, episodes = load_run(run).world_model, list(EpisodeDataset(data, split))
     found = {}
-    for index, episode in enumerate(episodes):
-        truth = torch.tensor(episode.video[:9].transpose(0, 3, 1, 2) / 255, dtype=torch.float32)
-
-        def rollout(actions, truth=truth, index=index):
-            rows = torch.tensor(actions[:9]).clone()
-            rows[-1] = 0
-            seeds = [noise_seed(0, split, index)]
-            return world_model.rollout(truth[None, 0], rows[None], window=9, seeds=seeds)[0]
-
-        predictions = {
-            "model": rollout(episode.actions),
-            "shuffled": rollout(episodes[donors[index]].actions),
-            "copy": truth[:1].expand_as(truth),
-            "codec": world_model.codec(truth[None])[0],
-        }
-        for kind, prediction in predictions.items():
-            mse = ((prediction.double() - truth.double()) ** 2).mean().item()
+    for index in range(len(episodes)):
+        truth, made = predictions(world_model, episodes, index)
+        for kind, video in made.items():
             ssim = [
                 structural_similarity(a, b, data_range=1, channel_axis=0)
-                for a, b in zip(truth.numpy(), prediction.numpy(), strict=True)
+                for a, b in zip(truth.numpy(), video.numpy(), strict=True)
             ]
-            found[index, kind] = (mse, np.mean(ssim))
+            found[index, kind] = squared_error(video, truth), np.mean(ssim)
     return found
 
 
@@ -114,7 +102,7 @@ def test_the_gap_is_that_of_the_two_splits(evaluated):
 def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
     first = read_scores(evaluated)
     for size in (1, 3):
-        run = tiny.make_run(tmp_path / str(size), data, batch_size=size)
+        run = tiny.make_run(tmp_path / str(size), data, batch_size=size, **FEW)
         evaluate_run(run, progress=False)
         for a, b in zip(first, read_scores(run), strict=True):
             assert (a.split, a.episode, a.kind) == (b.split, b.episode, b.kind)
@@ -133,7 +121,7 @@ def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
 
 
 def test_noise_depends_on_the_seed(evaluated, data, tmp_path):
-    run = tiny.make_run(tmp_path / "seed", data)
+    run = tiny.make_run(tmp_path / "seed", data, **FEW)
     evaluate_run(run, overrides=["evaluation.seed=1"], progress=False)
     models = [
         [r.values["mse"] for r in read_scores(each) if r.kind == "model"]
@@ -225,14 +213,14 @@ def test_picks_are_ranked_by_the_headline(evaluated):
 
 
 def test_whole_episodes_are_predicted_window_by_window(data, tmp_path):
-    run = tiny.make_run(tmp_path / "whole", data, frames=None, videos=0)
+    run = tiny.make_run(tmp_path / "whole", data, frames=None, **FEW)
     summary = evaluate_run(run, progress=False)
     assert {r.frames for r in read_scores(run)} == {13}
     assert summary.videos == []
 
 
 def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
-    run = tiny.make_run(tmp_path / "replaced", data)
+    run = tiny.make_run(tmp_path / "replaced", data, **FEW | {"videos": 1})
     evaluate_run(run, progress=False)
     words = ["evaluation.splits=[ind_test]"]
     evaluate_run(run, overrides=words, overwrite=True, progress=False)

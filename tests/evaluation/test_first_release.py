@@ -20,6 +20,7 @@ REFERENCE = Path(__file__).parents[1] / "reference" / "first_release"
 OPTIONS = [
     f"evaluation.{option}"
     for option in (
+        "splits=[ood_test]",
         "steps_sweep=[1,2]",
         "sweep_episodes=2",
         "counterfactual_episodes=2",
@@ -87,15 +88,13 @@ def test_its_run_gets_the_same_scores(folder, before):
     assert "evaluation.floor_episodes is now called evaluation.noise_floor" in outcome.stderr
     after = json.loads((run / "evaluation/summary.json").read_text())
     assert after["left_out"] == before["left_out"]
-    for split, expected in before["splits"].items():
-        found = after["splits"][split]
-        assert values(found["scores"]["rows"]) == pytest.approx(
-            values(expected["scores"]["rows"]), **SAME
-        )
-        assert curve(found) == pytest.approx(curve(expected), **SAME, nan_ok=True)
-        response = found["counterfactual"]["rows"]["model"]["response"]["value"]
-        expected = expected["counterfactual"]["rows"]["model"]["response"]["value"]
-        assert response == pytest.approx(expected, **SAME)
+    expected, found = (each["splits"]["ood_test"] for each in (before, after))
+    assert values(found["scores"]["rows"]) == pytest.approx(
+        values(expected["scores"]["rows"]), **SAME
+    )
+    assert curve(found) == pytest.approx(curve(expected), **SAME, nan_ok=True)
+    responses = [each["counterfactual"]["rows"]["model"]["response"] for each in (found, expected)]
+    assert responses[0]["value"] == pytest.approx(responses[1]["value"], **SAME)
 
 
 def values(rows):

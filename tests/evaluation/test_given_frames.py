@@ -9,17 +9,18 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clips import Clip, as_clip, derangement, noise_seed, plan_clips
+from acwm_core.evaluation.clips import Clip, as_clip, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.counterfactual import counterfactual, simulate_branches
 from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.interventions import perturbed, simulate_branches
+from acwm_core.evaluation.interventions import perturbed
 from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.responses import counterfactual
 from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from acwm_metrics.response import Response
 from tests import tiny
+from tests.evaluation.by_hand import predictions, squared_error
 from tests.evaluation.test_counterfactual import Episodes, Known, response, simulator
 
 GIVEN = 5
@@ -37,41 +38,15 @@ def run(tmp_path_factory, data):
     )
 
 
-def by_hand(world_model, episodes, rows, index):
-    """MSE of every row of an episode's first 9 frames, from the last given one on."""
-    video = torch.tensor(episodes[index].video[:9].transpose(0, 3, 1, 2) / 255).float()
-    donor = rows[derangement(len(rows), 0)[index]].clone()
-    donor[: GIVEN - 1] = rows[index][: GIVEN - 1]
-    seeds = [noise_seed(0, "ind_test", index)]
-
-    def rollout(actions):
-        given = video[None, :GIVEN]
-        return world_model.rollout(given, actions[None], window=9, seeds=seeds)[0]
-
-    predicted = {
-        "model": rollout(rows[index]),
-        "shuffled": rollout(donor),
-        "copy": video[GIVEN - 1 : GIVEN].expand_as(video),
-        "codec": world_model.codec(video[None])[0],
-    }
-    scored = slice(GIVEN - 1, None)
-    return {
-        kind: (made.double() - video.double())[scored].square().mean().item()
-        for kind, made in predicted.items()
-    }
-
-
 def test_scores_begin_with_the_last_given_frame(run, data):
     summary = evaluate_run(run, progress=False)
-    world_model, episodes = load_run(run).world_model, EpisodeDataset(data, "ind_test")
-    rows = [torch.tensor(episode.actions[:9]).clone() for episode in episodes]
-    for actions in rows:
-        actions[-1] = 0
+    world_model, episodes = load_run(run).world_model, list(EpisodeDataset(data, "ind_test"))
     found = {(r.episode, r.kind): r for r in read_scores(run) if r.split == "ind_test"}
     assert {result.frames for result in found.values()} == {9 - GIVEN + 1}
     for index in range(len(episodes)):
-        expected = by_hand(world_model, episodes, rows, index)
-        for kind, mse in expected.items():
+        truth, made = predictions(world_model, episodes, index, given=GIVEN)
+        for kind, video in made.items():
+            mse = squared_error(video, truth, GIVEN - 1)
             assert found[index, kind].values["mse"] == pytest.approx(mse, rel=1e-4)
     assert summary.provenance["context_frames"] == GIVEN
     assert summary.provenance["mode"] == "windows"

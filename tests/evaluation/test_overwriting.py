@@ -1,6 +1,6 @@
 """A result is not replaced by one of other settings without a word."""
 
-import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,10 +9,18 @@ from click.testing import CliRunner
 from acwm_core.cli.main import main
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
+from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
-from acwm_core.evaluation.storage import EPISODES, read_scores, replacing_result, result_file
+from acwm_core.evaluation.storage import (
+    EPISODES,
+    read_scores,
+    refuse_other_result,
+    replacing_result,
+    result_file,
+)
 from acwm_core.files import held
+from acwm_core.recipe import compose
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
 from acwm_severity.sweep import sweep_severity
@@ -21,11 +29,25 @@ from tests import tiny
 FAST = {"counterfactual_episodes": 0, "perturbed_episodes": 0, "videos": 0}
 
 
-@pytest.fixture
-def run(data, tmp_path):
-    folder = tiny.make_run(tmp_path / "run", data, **FAST)
+@pytest.fixture(scope="module")
+def done(data, tmp_path_factory):
+    folder = tiny.make_run(tmp_path_factory.mktemp("done") / "run", data, **FAST)
     evaluate_run(folder, progress=False)
     return folder
+
+
+@pytest.fixture
+def run(done, tmp_path):
+    """An evaluated run of one's own."""
+    return shutil.copytree(done, tmp_path / "run")
+
+
+def refuse(run, *overrides, **checksums):
+    """Ask whether a result may be replaced by one with these overrides, on these data."""
+    recipe = compose(run / "recipe.yaml", overrides, sections=["evaluation"])
+    there = Summary.read(run).provenance["dataset"]["checksums"]
+    config = EvaluationConfig(**recipe.evaluation)
+    refuse_other_result(run / FOLDER / SUMMARY, config, there | checksums)
 
 
 def test_other_settings_are_refused_before_any_work(run):
@@ -39,16 +61,14 @@ def test_other_settings_are_refused_before_any_work(run):
     assert (run / FOLDER / SUMMARY).read_bytes() == before
 
 
-def test_equal_settings_and_those_that_change_nothing_are_evaluated_again(run):
-    words = ["evaluation.batch_size=3", "evaluation.device=cpu"]
-    again = evaluate_run(run, overrides=words, progress=False)
-    assert again.provenance["evaluation"]["batch_size"] == 3
+def test_equal_settings_and_those_that_change_nothing_may_replace_it(run):
+    refuse(run)
+    refuse(run, "evaluation.batch_size=3", "evaluation.device=cuda")
 
 
-def test_other_data_are_refused(run, tmp_path):
-    other = tiny.make_dataset(tmp_path / "other", ind_test=6)
+def test_other_data_are_refused(run):
     with pytest.raises(DataError, match=r"made with ind_test of other data: .* --out"):
-        evaluate_run(run, data=other, progress=False)
+        refuse(run, ind_test="0" * 64)
 
 
 def test_overwriting_is_asked_for(run):
@@ -70,40 +90,28 @@ def test_another_folder_is_reported_and_compared_like_a_run(run, tmp_path):
     assert "evaluation.steps=1" in refused.output
 
 
-def test_a_curve_of_other_settings_is_not_replaced(run):
-    word = ["factors.colour=90,200"]
-    settings = ["evaluation.severity_episodes=2"]
-    list(sweep_severity(run, word, overrides=settings, workers=0, progress=False))
-    more = [*settings, "evaluation.steps=1"]
-    with pytest.raises(DataError, match=r"colour\.json holds a result made with .*--out"):
-        sweep_severity(run, word, overrides=more, workers=0, progress=False)
-    list(sweep_severity(run, word, overrides=more, overwrite=True, workers=0, progress=False))
-
-
-def test_values_of_a_curve_are_not_lost(run):
+def test_a_curve_of_other_settings_or_with_other_values_is_not_lost(run):
     """A sweep with other values of the same factor would replace the curve; one with more may."""
-    settings = ["evaluation.severity_episodes=2"]
 
-    def sweep(values, **options):
+    def sweep(values, *words, **options):
+        settings = ["evaluation.severity_episodes=2", *words]
         texts = [f"factors.colour={values}"]
         found = sweep_severity(run, texts, overrides=settings, workers=0, progress=False, **options)
         return [point.value for point in next(iter(found)).points]
 
     assert sweep("90,200") == [90, 200]
+    with pytest.raises(DataError, match=r"colour\.json holds a result made with .*--out"):
+        sweep("90,200", "evaluation.steps=1")
     with pytest.raises(DataError, match=r"holds a result made with colour=200: .*--out"):
         sweep("90,220")
     assert sweep("90,200,220") == [90, 200, 220]
-    assert sweep("90,220", overwrite=True) == [90, 220]
+    assert sweep("90,220", "evaluation.steps=1", overwrite=True) == [90, 220]
 
 
-WRONG = {"provenance": {"evaluation": []}}
-
-
-@pytest.mark.parametrize("text", [json.dumps(WRONG), "{}", "\x1b"])
-def test_a_result_that_cannot_be_read_is_worth_nothing(run, text):
-    (run / FOLDER / SUMMARY).write_text(text)
-    evaluate_run(run, progress=False)
-    assert Summary.read(run).splits
+@pytest.mark.parametrize("text", ['{"provenance": {"evaluation": []}}', "{}", "\x1b"])
+def test_a_result_that_cannot_be_read_is_worth_nothing(tmp_path, text):
+    (tmp_path / SUMMARY).write_text(text)
+    refuse_other_result(tmp_path / SUMMARY, EvaluationConfig(), {})
 
 
 def test_two_evaluations_at_once_are_refused(run, monkeypatch):

@@ -12,28 +12,27 @@ from acwm_core.evaluation import references
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.evaluate import evaluate_run, open_run
 from acwm_core.evaluation.references import KEPT, package_hash, references_file
-from acwm_core.evaluation.results import Summary
 from acwm_core.training.run_folder import RunFolder
 from tests import tiny
 
 
-@pytest.fixture
-def own(data, tmp_path):
-    """A dataset of one's own, and a run on it that was not evaluated."""
-    folder = shutil.copytree(data, tmp_path / "data")
+@pytest.fixture(scope="module")
+def own(data, tmp_path_factory):
+    """A dataset of one's own with kept rows, a run that was evaluated on it, and its scores."""
+    home = tmp_path_factory.mktemp("own")
+    folder = shutil.copytree(data, home / "data")
     shutil.rmtree(folder / "references", ignore_errors=True)
-    return folder, tiny.make_run(tmp_path / "run", folder, **tiny.SWEEP)
+    run = tiny.make_run(home / "run", folder, counterfactual_metrics=[], videos=0)
+    return folder, run, scores(run)
 
 
 def scores(run):
-    summary = Summary.read(run)
+    summary = evaluate_run(run, progress=False)
     return summary.splits, summary.gap
 
 
 def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monkeypatch):
-    folder, run = own
-    evaluate_run(run, progress=False)
-    first = scores(run)
+    folder, run, first = own
     kept = sorted(path.name for path in (folder / "references").iterdir())
     assert [name.rpartition("-")[0] for name in kept] == ["ind_test", "ood_test"]
 
@@ -45,37 +44,38 @@ def test_a_second_run_scores_its_own_rows_alone_and_comes_to_the_same(own, monke
         return score(self, plans, episodes, predictors)
 
     monkeypatch.setattr(references.Evaluator, "scores", watched)
-    evaluate_run(run, progress=False)
+    assert scores(run) == first
     assert scored
     assert not {each for predictors in scored for each in predictors} & {*KEPT}
-    assert scores(run) == first
     assert sorted(path.name for path in (folder / "references").iterdir()) == kept
 
 
-@pytest.mark.parametrize("harm", ["damaged", "read-only", "a file in its place"])
-def test_what_cannot_be_kept_or_read_is_scored_again(own, harm):
-    folder, run = own
-    evaluate_run(run, progress=False)
-    first = scores(run)
-    kept = folder / "references"
-    if harm == "damaged":
-        for path in kept.iterdir():
-            path.write_bytes(path.read_bytes()[:100])
-    else:
-        shutil.rmtree(kept)
-        if harm == "read-only":
-            folder.chmod(0o500)
-        else:
-            kept.write_text("")
-    try:
-        evaluate_run(run, progress=False)
-    finally:
-        folder.chmod(0o700)
+def test_what_is_damaged_is_scored_again(own):
+    folder, run, first = own
+    for path in (folder / "references").iterdir():
+        path.write_bytes(path.read_bytes()[:100])
     assert scores(run) == first
 
 
+@pytest.mark.parametrize("harm", ["read-only", "a file in its place"])
+def test_without_a_place_to_keep_them_they_are_scored_again(own, harm, tmp_path):
+    folder, run, first = own
+    away = (folder / "references").rename(tmp_path / "away")
+    if harm == "read-only":
+        folder.chmod(0o500)
+    else:
+        (folder / "references").write_text("")
+    try:
+        assert scores(run) == first
+    finally:
+        folder.chmod(0o700)
+        shutil.rmtree(folder / "references", ignore_errors=True)  # root may write there
+        (folder / "references").unlink(missing_ok=True)
+        away.rename(folder / "references")
+
+
 def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
-    folder, run = own
+    folder, run, _ = own
     _, evaluator = open_run(RunFolder(run), [])
     episodes = EpisodeDataset(folder, "ind_test")
     plans = plan_clips("ind_test", episodes.lengths, evaluator.config)

@@ -1,6 +1,5 @@
 """Sweeps of a factor: what is asked for, what is generated, what comes of it."""
 
-import re
 import shutil
 from dataclasses import replace
 
@@ -210,11 +209,6 @@ def test_all_sweeps_are_checked_before_the_first_is_generated(
     with pytest.raises(RecipeError, match=sentence):
         sweep_severity(run, texts, workers=0, progress=False)
     assert not (run / "evaluation").exists()
-    words = [word for text in texts for word in ("--sweep", text)]
-    result = CliRunner().invoke(main, ["evaluate", str(run), *words])
-    assert result.exit_code == 2
-    assert re.search(sentence, " ".join(result.output.split()))
-    assert not (run / "evaluation").exists()
 
 
 def test_another_number_of_episodes_is_generated_beside_what_is_there(swept, tmp_path):
@@ -245,22 +239,16 @@ def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
         sweep(run)
 
 
-def test_the_command_sweeps_and_misspelt_factors_end_with_a_sentence(swept, monkeypatch):
+def test_the_command_sweeps(swept, monkeypatch):
     run, _ = swept
     monkeypatch.setattr("acwm_core.data.generate.LocalExecutor", lambda _: LocalExecutor(0))
     word = "evaluation.severity_episodes=3"
-    result = CliRunner().invoke(
-        main, ["evaluate", str(run), word, "--overwrite", "--sweep", "factors.colour=90..220"]
-    )
+    words = ["--overwrite", "--sweep", "factors.colour=90..220", "--sweep", "factors.ground=30,60"]
+    result = CliRunner().invoke(main, ["evaluate", str(run), word, *words])
     assert result.exit_code == 0, result.output
-    assert "psnr dB, 3 episodes each" in result.output
+    assert result.output.count("psnr dB, 3 episodes each") == 2, result.output
     assert "train" in result.output
     assert "1.00" in result.output
-    result = CliRunner().invoke(main, ["evaluate", str(run), "--sweep", "factors.color=1..2"])
-    assert isinstance(result.exception, RecipeError) or "did you mean" in result.output
-    words = ["--overwrite", "--sweep", "factors.colour=90,200", "--sweep", "factors.ground=30,60"]
-    result = CliRunner().invoke(main, ["evaluate", str(run), word, *words])
-    assert result.output.count("psnr dB, 3 episodes each") == 2, result.output
 
 
 def test_curves_of_another_version_say_what_to_do(swept, tmp_path):

@@ -5,32 +5,21 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.evaluation.clips import noise_seed
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
-from acwm_report.page import write_report
-from tests import tiny
-
-HEADING = "How many sampling steps it takes"
+from tests.evaluation.by_hand import rollout, squared_error, true_clip
 
 
 def errors_by_hand(run, data, split, steps):
-    """MSE of the first three clips, predicted one at a time without the evaluation's code."""
-    world_model = load_run(run).world_model
-    found = []
-    for index, episode in zip(range(3), EpisodeDataset(data, split), strict=False):
-        truth = torch.tensor(episode.video[:9].transpose(0, 3, 1, 2) / 255).float()
-        rows = torch.tensor(episode.actions[:9])[None]
-        seeds = [noise_seed(0, split, index)]
-        predicted = world_model.rollout(truth[None, 0], rows, steps=steps, window=9, seeds=seeds)
-        found.append((predicted[0].double() - truth.double()).square().mean().item())
-    return np.array(found)
+    """MSE of the first three clips, predicted one at a time."""
+    world_model, episodes = load_run(run).world_model, EpisodeDataset(data, split)
+    few = [episodes[index] for index in range(3)]
+    made = [(rollout(world_model, each, steps=steps), true_clip(each)[0]) for each in few]
+    return np.array([squared_error(*pair) for pair in made])
 
 
 @pytest.mark.parametrize("split", ["ind_test", "ood_test"])
@@ -55,22 +44,6 @@ def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):
     assert point.steps == load_run(evaluated).world_model.objective.steps
     expected = np.mean([row.values["mse"] for row in rows if row.episode < 3])
     assert point.scores["mse"].value == pytest.approx(expected, rel=1e-6)
-
-
-def test_the_report_shows_it(evaluated, tmp_path):
-    page = write_report([evaluated], tmp_path / "page.html").read_text()
-    assert HEADING in page
-    assert "beyond 6 steps" in page
-    for split in Summary.read(evaluated).splits.values():
-        for point in split.steps.points:
-            assert f"{point.scores['psnr'].value:.2f}" in page
-
-
-def test_without_a_sweep_there_is_neither_curve_nor_section(data, tmp_path):
-    run = tiny.make_run(tmp_path / "run", data, videos=0)
-    summary = evaluate_run(run, progress=False)
-    assert all(split.steps is None for split in summary.splits.values())
-    assert HEADING not in write_report([run]).read_text()
 
 
 def test_summaries_from_before_there_was_a_curve_are_read(evaluated, tmp_path):

@@ -6,14 +6,11 @@ import re
 from collections import defaultdict
 
 import pytest
-from click.testing import CliRunner
 
-from acwm_core.evaluation.benchmark import published_for, published_tables
+from acwm_core.evaluation.protocol import published_for, published_tables
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
-from acwm_report.commands import evaluate
 from acwm_report.terminal import about_published, print_summary
-from tests import tiny
 
 TABLES = published_tables()
 ROWS = [row for table in TABLES.values() for row in table.rows]
@@ -143,10 +140,8 @@ def test_the_command_prints_both(evaluated, capsys):
     assert re.search(r"9\.997▼ +20\.00▼", capsys.readouterr().out)
 
 
-def test_an_environment_of_ones_own_has_none(data, tmp_path):
-    settings = {"videos": 0, "metrics": ["mse"], "splits": ["ind_test"]}
-    run = tiny.make_run(tmp_path / "run", data, **settings)
-    outcome = CliRunner().invoke(evaluate, [str(run)])
-    assert outcome.exit_code == 0, outcome.output
-    assert "published" not in outcome.output
-    assert Summary.read(run).published is None
+def test_an_environment_of_ones_own_has_none(evaluated, capsys):
+    summary = Summary.read(evaluated)
+    assert summary.published is None
+    print_summary(summary)
+    assert "published" not in capsys.readouterr().out

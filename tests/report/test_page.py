@@ -1,6 +1,7 @@
 import base64
 import io
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import DataError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import (
     Estimate,
     MetricInfo,
@@ -24,8 +24,9 @@ from acwm_report.page import write_report
 from acwm_report.run import EvaluatedRun
 from acwm_report.table import Scale
 from acwm_report.videos import action_traces
-from tests import tiny
 from tests.report import synthetic
+
+CLIPS = synthetic.clips(np.linspace(20, 26, 4))
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
@@ -116,12 +117,17 @@ def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
     assert summary.provenance["weights_sha256"][:16] in text
 
 
-def test_several_runs_are_compared(evaluated, data, tmp_path):
-    other = tiny.make_run(tmp_path / "second", data, seed=5, videos=0)
-    evaluate_run(other, progress=False)
-    (other / "metrics.csv").unlink()
-    out = write_report([evaluated, other], tmp_path / "both.html")
-    text = out.read_text(encoding="utf-8")
+def test_the_curve_of_sampling_steps_is_shown(page, evaluated):
+    assert "How many sampling steps it takes" in page
+    assert "beyond 6 steps" in page
+    for split in Summary.read(evaluated).splits.values():
+        for point in split.steps.points:
+            assert f"{point.scores['psnr'].value:.2f}" in page
+
+
+def test_several_runs_are_compared(tmp_path):
+    runs = [synthetic.run(tmp_path / name, CLIPS) for name in ("first", "second")]
+    text = write_report(runs, tmp_path / "both.html").read_text(encoding="utf-8")
     parsed = Page(text)
     assert {"run1", "run2"} <= set(parsed.ids)
     assert len(parsed.ids) == len(set(parsed.ids))
@@ -130,30 +136,29 @@ def test_several_runs_are_compared(evaluated, data, tmp_path):
     assert "Larger than chance?" in text
 
 
-def test_by_default_the_report_lies_in_the_run_and_names_are_escaped(data, tmp_path):
-    run = tiny.make_run(tmp_path / "<script>alert(1)<", data, videos=0, metrics=("mse",))
-    evaluate_run(run, progress=False)
+def test_by_default_the_report_lies_in_the_run_and_names_are_escaped(tmp_path):
+    run = synthetic.run(tmp_path / "<script>alert(1)<", CLIPS)
     assert write_report([run]) == run / "report.html"
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "with the true actions" in page
     assert "<script>alert" not in page
+    assert "How many sampling steps" not in page  # nothing was swept
 
 
-def test_what_is_missing_is_named(evaluated, data, tmp_path):
+def test_what_is_missing_is_named(evaluated, tmp_path):
     with pytest.raises(DataError, match="no run folder"):
         write_report([tmp_path / "nothing"])
-    run = tiny.make_run(tmp_path / "run", data)
-    with pytest.raises(DataError, match="acwm evaluate"):
-        write_report([run])
     with pytest.raises(DataError, match="at least one run"):
         write_report([])
-    (run / "evaluation").mkdir()
+    run = shutil.copytree(evaluated, tmp_path / "run")
+    next((run / "evaluation/videos").glob("*.mp4")).unlink()
+    with pytest.raises(DataError, match=r"video .* is missing"):
+        write_report([run])
     (run / "evaluation/summary.json").write_text('{"run": 3}')
     with pytest.raises(DataError, match="is not a summary"):
         write_report([run])
-    evaluate_run(run, progress=False)
-    next((run / "evaluation/videos").glob("*.mp4")).unlink()
-    with pytest.raises(DataError, match=r"video .* is missing"):
+    (run / "evaluation/summary.json").unlink()
+    with pytest.raises(DataError, match="acwm evaluate"):
         write_report([run])
 
 

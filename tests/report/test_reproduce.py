@@ -3,6 +3,7 @@
 import shlex
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from acwm_core.cli import main
@@ -15,6 +16,7 @@ from acwm_report.reproduce import commands
 from acwm_severity.curves import read_severity
 from acwm_severity.sweep import sweep_severity
 from tests import tiny
+from tests.report import synthetic
 
 SWEEP = "factors.colour=200,90"
 
@@ -86,12 +88,13 @@ def test_the_overrides_compose_to_the_same_settings(
 
 def test_the_commands_run_and_make_the_same(tmp_path):
     """Trained on one dataset, evaluated on another, with overrides: all lines, from nothing."""
-    data = tiny.make_dataset(tmp_path / "the data")
-    other = tiny.make_dataset(tmp_path / "other", train=0, ind_test=3, ood_test=3)
+    data = tiny.make_dataset(tmp_path / "the data", ind_test=0, ood_test=0)
+    other = tiny.make_dataset(tmp_path / "other", train=0, ind_test=2, ood_test=2)
     trainer = {"max_steps": 1, "accelerator": "cpu", "enable_progress_bar": False}
     parts = {"trainer": trainer, "training": {"warmup_steps": 0, "cpu_threads": 1}}
     run = tiny.make_run(tmp_path / "run", data, parts=parts, videos=0)
     overrides = ["evaluation.episodes=2", "evaluation.frames=5", "evaluation.metrics=[mse,psnr]"]
+    overrides += ["evaluation.counterfactual_metrics=[]", "evaluation.perturbed_episodes=0"]
     evaluate_run(run, data=other, overrides=overrides, progress=False)
     before = Summary.read(run)
     lines = commands(run, before)
@@ -146,18 +149,27 @@ def test_an_imported_run_is_imported_again(evaluated, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        ([], "first 9 frames of 5 of 5 ind_test, 4 of 4 ood_test episodes, 2 sampling steps"),
-        (
-            [PUBLISHED, "evaluation.cuts=2", "evaluation.episodes=3", "evaluation.steps=1"],
-            "2 windows of 9 frames of 3 of 5 ind_test, 3 of 4 ood_test episodes, 1 sampling step,",
+def test_the_page_says_which_episodes_were_taken(tmp_path):
+    scores, windows = np.linspace(20, 26, 4), np.linspace(20, 26, 6).reshape(3, 2)
+    runs = [
+        synthetic.run(
+            tmp_path / "first",
+            [*synthetic.clips(scores), *synthetic.clips(scores, "ood_test")],
+            settings={"frames": 9},
+            steps=2,
         ),
-        (["evaluation.frames=null", "evaluation.episodes=4"], "all frames of 4 of 5 ind_test"),
-    ],
-)
-def test_the_page_says_which_episodes_were_taken(data, tmp_path, overrides, said):
-    run = tiny.make_run(tmp_path / "run", data, videos=0, metrics=("mse",))
-    evaluate_run(run, overrides=overrides, progress=False)
-    assert said in write_report([run]).read_text(encoding="utf-8")
+        synthetic.run(
+            tmp_path / "windows",
+            synthetic.clips(windows, starts=(0, 4)),
+            settings={"frames": 9, "cuts": 2},
+            steps=1,
+        ),
+        synthetic.run(tmp_path / "whole", synthetic.clips(scores)),
+    ]
+    text = write_report(runs, tmp_path / "page.html").read_text(encoding="utf-8")
+    for said in (
+        "first 9 frames of 4 of 20 ind_test, 4 of 20 ood_test episodes, 2 sampling steps",
+        "2 windows of 9 frames of 3 of 20 ind_test episodes, 1 sampling step,",
+        "all frames of 4 of 20 ind_test episodes, 5 sampling steps",
+    ):
+        assert said in text

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from acwm_core.evaluation.benchmark import published_for
 from acwm_core.evaluation.metric import MetricInfo
+from acwm_core.evaluation.protocol import published_for
 from acwm_core.plugins import Catalog
 from acwm_report import run as runs
 from acwm_report.run import EvaluatedRun, described

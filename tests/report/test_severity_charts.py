@@ -4,60 +4,63 @@ import html
 import json
 import re
 import shlex
+import shutil
 
 import pytest
 
-from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_report.page import export_report, write_report
+from acwm_core.evaluation.results import Summary
+from acwm_report.charts import outdated_curves, severity_charts
+from acwm_report.page import write_report
+from acwm_report.run import EvaluatedRun
 from acwm_severity.sweep import sweep_severity
-from tests import tiny
 
 CURVE = "run1-severity-colour"
 VALUES = "factors.colour=200,90"
 
 
-def sweep(run, text=VALUES):
-    list(sweep_severity(run, [text], workers=0, progress=False))
+@pytest.fixture(scope="module")
+def swept(evaluated, tmp_path_factory):
+    run = shutil.copytree(evaluated, tmp_path_factory.mktemp("swept") / "run")
+    words = ["evaluation.severity_episodes=2"]
+    list(sweep_severity(run, [VALUES], overrides=words, workers=0, progress=False))
+    return run
 
 
 def page_of(run):
     return html.unescape(write_report([run]).read_text(encoding="utf-8"))
 
 
-@pytest.fixture
-def run(data, tmp_path):
-    settings = {"severity_episodes": 2, "counterfactual_episodes": 0, "perturbed_episodes": 0}
-    run = tiny.make_run(tmp_path / "run", data, **settings)
-    evaluate_run(run, progress=False)
-    sweep(run)
-    assert CURVE in page_of(run)
-    other = tiny.make_run(tmp_path / "other", data, seed=1)
-    (other / "model.safetensors").replace(run / "model.safetensors")  # it was trained on
-    return run
+def of_other_weights(run, evaluated):
+    """Let the curve be of other weights, and evaluated then."""
+    file = run / "evaluation" / "severity" / "colour.json"
+    curve = json.loads(file.read_text())
+    curve["provenance"] |= {"weights_sha256": "0" * 64, "evaluated": evaluated}
+    file.write_text(json.dumps(curve))
+    return EvaluatedRun.read(run, "run1")
 
 
-def test_a_curve_of_earlier_weights_is_left_out_until_it_is_made_anew(run, tmp_path):
-    evaluate_run(run, progress=False)
+def test_a_curve_of_the_same_weights_is_shown(swept):
+    read = EvaluatedRun.read(swept, "run1")
+    assert [chart.name for chart in severity_charts(read)] == [CURVE]
+    assert outdated_curves(read) == []
+
+
+def test_a_curve_of_earlier_weights_asks_to_be_made_anew(swept, tmp_path):
+    run = shutil.copytree(swept, tmp_path / "run")
+    read = of_other_weights(run, Summary.read(run).provenance["evaluated"])
+    assert severity_charts(read) == []
+    assert [older for _, older in outdated_curves(read)] == [True]
     page = page_of(run)
     assert CURVE not in page
     assert "The curve of colour is left out, because it is of earlier weights" in page
-    assert [each.name for each in export_report([run], tmp_path) if "severity" in each.name] == []
     (command,) = re.findall(r"<code>(acwm evaluate .* --sweep .*)</code>", page)
     assert shlex.split(command) == ["acwm", "evaluate", str(run), "--sweep", VALUES]
-    sweep(run)
-    page = page_of(run)
-    assert CURVE in page
-    assert "left out" not in page
 
 
-def test_a_curve_of_later_weights_asks_for_the_rest_anew(run):
-    sweep(run, "factors.ground=30,60")
-    made = run / "evaluation" / "severity" / "ground.json"
-    curve = json.loads(made.read_text())
-    curve["provenance"]["evaluated"] = "2999-01-01T00:00:00+00:00"  # times have whole seconds
-    made.write_text(json.dumps(curve))
+def test_a_curve_of_later_weights_asks_for_the_rest_anew(swept, tmp_path):
+    run = shutil.copytree(swept, tmp_path / "run")
+    read = of_other_weights(run, "2999-01-01T00:00:00+00:00")
+    assert [older for _, older in outdated_curves(read)] == [False]
     page = page_of(run)
-    assert CURVE in page
-    assert "run1-severity-ground" not in page
-    assert "The curve of ground is left out, because it is of later weights" in page
+    assert "The curve of colour is left out, because it is of later weights" in page
     assert f"make the rest anew with <code>acwm evaluate {run}</code>" in page

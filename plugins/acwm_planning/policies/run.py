@@ -15,8 +15,8 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
-from acwm_core.evaluation.interventions import plan_branches
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import progress_bar

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.simulate import simulate
+from acwm_core.env.environment import ActionSpec, Environment
+from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import noting
-from acwm_core.evaluation.clips import Predictor
+from acwm_core.evaluation.clips import Clip, Predictor, cut_episode, donor_actions, read_clips
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
 from acwm_core.evaluation.summarise import summary_of
 from acwm_core.evaluation.videos import ShownClip, shown
+
+SIZES = (0.1, 0.5)
+"""Shifts of one action dimension, as fractions of half its range."""
 
 ROWS: tuple[Predictor, ...] = ("model", "codec")
 """The rows that are compared: the model, and the codec's reconstruction of the true responses,
@@ -43,6 +50,75 @@ class Branch:
 
 Simulated = tuple[list[Branch], Prediction]
 """Other actions for a clip, and the clip's true video with theirs as `Prediction.branches`."""
+
+
+def max_branches(spec: ActionSpec) -> int:
+    """The largest number of branches that `plan_branches` returns."""
+    return 4 + len(SIZES) * spec.size
+
+
+def plan_branches(
+    actions: ActionRows, another: ActionRows, still: NDArray[np.float32], spec: ActionSpec
+) -> list[Branch]:
+    """All branches of a clip, without those whose actions equal the clip's own.
+
+    * ``another``: another episode's actions.
+    * ``still``: nothing moves.
+    * ``reversed``: the clip's actions in reversed order.
+    * ``mirrored``: the opposite of each action, 2·still − action, clipped to the bounds.
+    * for each dimension and each of `SIZES`: the actions with this dimension shifted in all frames,
+      in the direction in which the bounds cut off less of the shift.
+    """
+    taken = actions[:-1]
+    low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+    asked: list[tuple[str, ActionRows, float]] = [
+        ("another", another[:-1], 0.0),
+        ("still", np.tile(still, (len(taken), 1)), 0.0),
+        ("reversed", taken[::-1], 0.0),
+        ("mirrored", np.clip(2 * still - taken, low, high), 0.0),
+    ]
+    for (dimension, name), size in itertools.product(enumerate(spec.names), SIZES):
+        values, bounds = taken[:, dimension], (spec.low[dimension], spec.high[dimension])
+        step = size * (bounds[1] - bounds[0]) / 2
+        up, down = np.clip(values + step, *bounds), np.clip(values - step, *bounds)
+        rows = taken.copy()
+        rows[:, dimension] = up if (up - values).sum() >= (values - down).sum() else down
+        asked.append((name, rows, size))
+    last = np.zeros((1, spec.size))
+    branches = [
+        Branch(kind, np.concatenate([rows, last]).astype(np.float32), size)
+        for kind, rows, size in asked
+    ]
+    return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
+
+
+def simulate_branches(
+    environment: Environment,
+    clips: Sequence[Clip],
+    episodes: EpisodeDataset,
+    frames: int,
+    estimator: StateEstimator | None = None,
+) -> Iterator[Simulated]:
+    """Simulate each clip again, cut to at most `frames` frames, and its branches."""
+    for clip, whole in read_clips(clips, episodes):
+        length = min(frames, len(whole.video))
+        episode = cut_episode(whole, 0, length)
+        environment.reset(options={"spec": episode.spec})
+        free = slice(clip.given - 1, length)
+        branches = [
+            replace(branch, actions=np.concatenate([episode.actions[: free.start], branch.actions]))
+            for branch in plan_branches(
+                episode.actions[free],
+                donor_actions(clip, whole.actions, episodes)[free],
+                environment.still_action(),
+                environment.card.action,
+            )
+        ]
+        truths: list[Prediction] = []
+        for actions in [episode.actions, *(branch.actions for branch in branches)]:
+            made = simulate(environment, episode.spec, actions, frames=length)
+            truths.append(Prediction.truth(made, environment.card, estimator, clip))
+        yield branches, replace(truths[0], branches=tuple(truths[1:]))
 
 
 def counterfactual(
