@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from acwm_core.errors import DataError, suggest
-from acwm_core.evaluation.results import Score, Summary
+from acwm_core.evaluation.results import MetricInfo, Score, Summary, write_json
 from acwm_core.evaluation.statistics import holm, paired_bootstrap
 from acwm_core.evaluation.storage import read_scores
-from acwm_core.files import writable, written_whole
+from acwm_core.files import writable
 from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], Score]
@@ -84,11 +84,8 @@ class Comparison:
 
     def write(self, path: Path) -> None:
         """Write the comparison as JSON."""
-        from pydantic import TypeAdapter
-
         writable(path).parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(path) as partial:
-            partial.write_bytes(TypeAdapter(Comparison).dump_json(self, indent=1) + b"\n")
+        write_json(path, self)
 
 
 def compare_runs(
@@ -120,15 +117,14 @@ def compare_runs(
     names = _shared("metric", metrics, [list(each.metrics) for each in summaries.values()])
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
     rows = dict(zip(summaries, map(_model_rows, folders), strict=True))
-    found: list[Difference] = []
-    for split in chosen:
-        common = _common_clips(split, rows, warnings)
-        for name, pair in itertools.product(names, itertools.combinations(common, 2)):
-            better = first.metrics[name].higher_is_better
-            found += _difference(split, name, {label: common[label] for label in pair}, better)
+    metrics_of = {name: first.metrics[name] for name in names}
+    found = [
+        difference
+        for split in chosen
+        for difference in _differences(split, _common_clips(split, rows, warnings), metrics_of)
+    ]
     if not found:
         raise DataError("no metric is defined on the clips that the runs share")
-    corrected = holm([each.p for each in found])
     return Comparison(
         runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
         hashes={
@@ -138,12 +134,9 @@ def compare_runs(
         },
         environment=first.parts["env"],
         protocol=first.protocol,
-        units={name: first.metrics[name].unit for name in names},
-        higher_is_better={name: first.metrics[name].higher_is_better for name in names},
-        differences=[
-            replace(each, p_corrected=p, winner=each.winner if _is_certain(each, p) else None)
-            for each, p in zip(found, corrected, strict=True)
-        ],
+        units={name: info.unit for name, info in metrics_of.items()},
+        higher_is_better={name: info.higher_is_better for name, info in metrics_of.items()},
+        differences=_corrected(found),
         tests=sum(each.p is not None for each in found),
         warnings=warnings,
         uses=[
@@ -154,9 +147,29 @@ def compare_runs(
     )
 
 
-def _is_certain(each: Difference, p: float | None) -> bool:
-    """Whether a difference is larger than chance; infinite differences need no test."""
-    return math.isinf(each.difference) or (p is not None and p < 0.05)
+def _differences(
+    split: str, clips: Mapping[str, list[Score]], metrics: Mapping[str, MetricInfo]
+) -> Iterator[Difference]:
+    """Compare every pair of runs on their common clips; p-values are not corrected yet."""
+    for (name, info), pair in itertools.product(metrics.items(), itertools.combinations(clips, 2)):
+        of_pair = {label: clips[label] for label in pair}
+        yield from _difference(split, name, of_pair, info.higher_is_better)
+
+
+def _corrected(found: Sequence[Difference]) -> list[Difference]:
+    """Correct the p-values; no run wins unless the difference is larger than chance.
+
+    Infinite differences need no test.
+    """
+    corrected = holm([each.p for each in found])
+    certain = [
+        math.isinf(each.difference) or (p is not None and p < 0.05)
+        for each, p in zip(found, corrected, strict=True)
+    ]
+    return [
+        replace(each, p_corrected=p, winner=each.winner if sure else None)
+        for each, p, sure in zip(found, corrected, certain, strict=True)
+    ]
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:

@@ -183,14 +183,6 @@ def picky(self, factors, rng):
     START(self, factors, rng)
 
 
-def test_values_that_the_simulator_refuses_end_the_sweep_at_once(swept, monkeypatch):
-    run, _ = swept
-    monkeypatch.setattr(tiny.Drift, "_start", picky)
-    with pytest.raises(RecipeError, match=r"ground=60 is not possible: .*too bright"):
-        sweep(run, "factors.ground=30,60")
-    assert not list((run / "evaluation" / "severity").rglob("ground=30"))
-
-
 @pytest.mark.parametrize(
     ("second", "sentence"),
     [
@@ -230,13 +222,6 @@ def test_other_data_in_the_folder_is_not_taken_for_the_sweeps(swept, tmp_path):
         sweep(run, data=other)
     shutil.rmtree(home)
     assert sweep(run, data=other).provenance["dataset"]["seed"] == 1
-
-
-def test_a_simulator_that_has_changed_is_not_asked(swept, monkeypatch):
-    run, _ = swept
-    monkeypatch.setattr(tiny.Drift, "side", 20)
-    with pytest.raises(DataError, match="does not reproduce the videos of the data"):
-        sweep(run)
 
 
 def test_the_command_sweeps(swept, monkeypatch):

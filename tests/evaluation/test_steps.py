@@ -9,7 +9,6 @@ import pytest
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
 from tests.evaluation.by_hand import rollout, squared_error, true_clip
 
@@ -36,14 +35,6 @@ def test_the_curve_is_that_of_an_independent_computation(evaluated, data, split)
         each = -10 * np.log10(errors[point.steps]) + 10 * np.log10(errors[6])
         assert point.change["psnr"].value == pytest.approx(each.mean(), abs=1e-3)
         assert point.change["psnr"].low is None  # three episodes are too few
-
-
-def test_at_the_recipes_own_steps_it_meets_the_model_row(evaluated):
-    rows = [r for r in read_scores(evaluated) if r.kind == "model" and r.split == "ind_test"]
-    point = Summary.read(evaluated).splits["ind_test"].steps.points[1]
-    assert point.steps == load_run(evaluated).world_model.objective.steps
-    expected = np.mean([row.values["mse"] for row in rows if row.episode < 3])
-    assert point.scores["mse"].value == pytest.approx(expected, rel=1e-6)
 
 
 def test_summaries_from_before_there_was_a_curve_are_read(evaluated, tmp_path):

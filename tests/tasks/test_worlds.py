@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.score import estimator_for
 from tests.tasks.playing import begin, like, make, seen, solve
 
@@ -18,35 +19,32 @@ SLOW = (
     "push_sand.gather",
     "pour_water.fill",
 )
-every = pytest.mark.parametrize(
-    "name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
-)
+EVERY = [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
 
-def made(name):
-    return make(*name.split("."))
-
-
-@every
-def test_the_solution_succeeds_and_comes_nearer(name):
-    env = made(name)
-    infos = solve(env)
+@pytest.fixture(scope="module", params=EVERY)
+def world(request):
+    """A task's name, and the environment with it."""
+    env = make(*request.param.split("."))
+    yield request.param, env
     env.close()
+
+
+def test_the_solution_succeeds_and_comes_nearer(world):
+    infos = solve(world[1])
     assert infos[-1]["success"]
     assert not infos[-1]["failed"]
     assert infos[0]["distance"] > 2 * infos[-1]["distance"]
     assert not infos[0]["success"]
 
 
-@every
-def test_another_episode_has_another_goal(name):
+def test_another_episode_has_another_goal(world):
     """That the same one has the same goal, and starts as without it, is what its checks try."""
-    env = made(name)
+    _, env = world
     begin(env)
     goal = env.goal
     begin(env, 1)
     assert not np.array_equal(env.goal.frame, goal.frame)
-    env.close()
 
 
 TOLD = {
@@ -57,24 +55,17 @@ TOLD = {
 """How far the distance of what is read from a frame may be off; 0.05 for others."""
 
 
-@every
-def test_an_estimator_reads_what_the_distance_needs(name):
-    pytest.importorskip("torch")
-    import torch
-
-    env = made(name)
-    frames, distances = [], []
+def test_an_estimator_reads_what_the_distance_needs(world):
+    name, env = world
     frame, info = begin(env)
-    for picture, state in ((frame, info["distance"]), (env.goal.frame, 0.0)):
-        frames.append(torch.from_numpy(picture.copy()).permute(2, 0, 1) / 255)
-        distances.append(state)
-    read = estimator_for(env.environment.card).estimate(torch.stack(frames))
+    video = as_clip(np.stack([frame, env.goal.frame]))
+    read = estimator_for(env.environment.card).estimate(video)
     told = env.task.distance(read, env.goal)
     assert env.task.success(read, env.goal).shape == (2,)
     known = np.isfinite(told)  # the start may hide a hand
     assert known[1]
-    np.testing.assert_allclose(told[known], np.array(distances)[known], atol=TOLD.get(name, 0.05))
-    env.close()
+    distances = np.array([info["distance"], 0.0])
+    np.testing.assert_allclose(told[known], distances[known], atol=TOLD.get(name, 0.05))
 
 
 def test_cubes_are_placed_by_their_middles_whatever_is_unseen():
