@@ -82,7 +82,8 @@ def test_its_run_is_reported(folder, tmp_path):
 
 def test_its_run_gets_the_same_scores(folder, before):
     run = folder / "run"
-    arguments = ["evaluate", str(run), "--data", str(folder / "data"), *OPTIONS]
+    data = ["--data", str(folder / "data")]
+    arguments = ["evaluate", str(run), *data, "--overwrite", *OPTIONS]
     outcome = CliRunner().invoke(main, arguments)
     assert outcome.exit_code == 0, outcome.output
     assert "evaluation.floor_episodes is now called evaluation.noise_floor" in outcome.stderr

@@ -105,14 +105,14 @@ def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
 
 def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
     text = " ".join(" ".join(Page(page).text).split())
-    summary = Summary.read(evaluated)
+    run, summary = EvaluatedRun.read(evaluated, "run1"), Summary.read(evaluated)
     for split in summary.splits.values():
         for row in split.scores.rows.values():
             assert f"{row['psnr'].value:.2f}" in text
-            assert f"{row['mse'].value * 1000:.2f}" in text
+            assert run.scale("mse").number(row["mse"].value) in text
         pair = split.scores.paired["shuffled"]["psnr"]
         assert f"{pair.better}/{pair.clips}" in text
-    assert EvaluatedRun.read(evaluated, "run1").verdict in text
+    assert run.verdict in text
     assert "colour" in text
     assert summary.provenance["weights_sha256"][:16] in text
 
