@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acwm_formats.recordings import Recording
+from acwm_formats.timeline import Recording
 
 
 @dataclass(frozen=True)

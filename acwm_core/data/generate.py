@@ -18,7 +18,7 @@ from typing import Any
 from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
 from acwm_core.data.readme import write_readme
-from acwm_core.data.shards import ShardRecord, open_shard, shard_name, write_shard
+from acwm_core.data.shards import Packed, ShardRecord, open_shard, shard_name, write_shard
 from acwm_core.data.simulate import make_environment, simulated
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, FactorSetting, Split, draw_factors
@@ -27,7 +27,7 @@ from acwm_core.executors import Executor, LocalExecutor, Report, progress_bar
 from acwm_core.files import LOCK, held, remove_partial, writing
 from acwm_core.plugins import catalog
 
-EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode]]
+EpisodeSource = Callable[[Sequence[EpisodeSpec]], Iterable[Episode | Packed]]
 """Yields the episodes of given specs, one after another; importable and picklable."""
 
 SHARD_EPISODES = 32
@@ -167,7 +167,7 @@ def make_shard(task: ShardTask, report: Report) -> tuple[Split, ShardRecord]:
     numbers = range(task.first, task.first + task.episodes)
     specs = [task.card.spec(task.split, number) for number in numbers]
 
-    def counted() -> Iterator[Episode]:
+    def counted() -> Iterator[Episode | Packed]:
         for episode in task.source(specs):
             yield episode
             report(1)

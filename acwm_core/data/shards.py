@@ -144,8 +144,22 @@ class _Summed:
         return self._file.write(data)
 
 
+class Packed(NamedTuple):
+    """An episode that is already encoded.
+
+    Attributes:
+        spec: which episode.
+        actions: ``[T, A]`` float32.
+        members: bytes by name, in the order of `MEMBERS`.
+    """
+
+    spec: EpisodeSpec
+    actions: NDArray[np.float32]
+    members: Mapping[str, bytes]
+
+
 def write_shard(
-    path: Path, episodes: Iterable[Episode], fps: int, versions: Mapping[str, str]
+    path: Path, episodes: Iterable[Episode | Packed], fps: float, versions: Mapping[str, str]
 ) -> ShardRecord:
     """Write `episodes` to the tar file `path`, which appears only once it is complete.
 
@@ -165,9 +179,10 @@ def write_shard(
         with TarWriter(
             cast(Any, file), encoder=False, user="", group="", mode=0o644, mtime=0
         ) as tar:
-            for episode in episodes:
+            for each in episodes:
+                episode = each if isinstance(each, Packed) else pack(each, fps, versions)
                 key = f"{episode.spec.split}-{episode.spec.index:06d}"
-                for name, data in pack(episode, fps, versions).items():
+                for name, data in episode.members.items():
                     tar.write({"__key__": key, name: data})  # one by one, to keep their order
                 first = first if actions else episode.spec.index
                 actions.append(episode.actions)
@@ -175,8 +190,8 @@ def write_shard(
     return ShardRecord(path.name, first, lengths, file.size, file.sha256.hexdigest(), sums)
 
 
-def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, bytes]:
-    """Encode `episode` as the members of a shard: bytes by name, in the order of `MEMBERS`."""
+def pack(episode: Episode, fps: float, versions: Mapping[str, str]) -> Packed:
+    """Encode `episode` as the members of a shard."""
     members = {
         "video.mkv": encode_video(episode.video, fps),
         "mask.mkv": encode_masks(episode.masks, fps),
@@ -184,14 +199,35 @@ def pack(episode: Episode, fps: int, versions: Mapping[str, str]) -> dict[str, b
         "states.npz": to_npz(episode.states),
         "contacts.npy": to_npy(episode.contacts),
     }
-    about = {
-        "spec": episode.spec.to_dict(),
-        "factors": dict(episode.factors),
-        "ood_label": episode.ood_label,
+    return joined(
+        episode.spec, episode.actions, members, versions, episode.factors, episode.ood_label
+    )
+
+
+def joined(
+    spec: EpisodeSpec,
+    actions: NDArray[np.float32],
+    members: Mapping[str, bytes],
+    versions: Mapping[str, str],
+    factors: Mapping[str, Any],
+    ood_label: str | None,
+    facts: Mapping[str, Any] | None = None,
+) -> Packed:
+    """Join encoded members, all but ``json``, which is made here.
+
+    Args:
+        facts: what else is known of a recorded episode, e.g. its task.
+    """
+    about: dict[str, Any] = {
+        "spec": spec.to_dict(),
+        "factors": dict(factors),
+        "ood_label": ood_label,
         "versions": dict(versions),
         "crc32": {name: zlib.crc32(data) for name, data in members.items()},
     }
-    return {**members, "json": json.dumps(about, sort_keys=True).encode()}
+    about |= {"facts": dict(facts)} if facts else {}
+    data = json.dumps(about, sort_keys=True).encode()
+    return Packed(spec, actions, {**members, "json": data})
 
 
 class Member(NamedTuple):
@@ -254,12 +290,12 @@ class ShardReader:
         return self.decoded(position, name, from_npy)
 
     def about(self, position: int) -> dict[str, Any]:
-        """The ``json`` member: spec, factors, ood_label, versions, crc32."""
+        """The ``json`` member: spec, factors, ood_label, versions, crc32, and facts if recorded."""
         wanted = ("spec", "factors", "ood_label", "versions", "crc32")
 
         def parsed(data: bytes) -> dict[str, Any]:
             about = parse_json(data)
-            return {name: about[name] for name in wanted}
+            return {name: about[name] for name in wanted} | {"facts": about.get("facts", {})}
 
         return self.decoded(position, "json", parsed)
 

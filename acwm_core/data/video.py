@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from av.codec.context import Flags
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from acwm_core.env.card import exact_rate
 from acwm_core.errors import DataError, ShapeError
 from acwm_core.files import written_whole
 
@@ -50,7 +52,7 @@ KEYFRAMES = 16
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
-def encode_video(frames: NDArray[np.uint8], fps: int = 10) -> bytes:
+def encode_video(frames: NDArray[np.uint8], fps: float = 10) -> bytes:
     """Lossless Matroska bytes of frames ``[T, H, W, 3]`` uint8.
 
     Raises:
@@ -61,7 +63,7 @@ def encode_video(frames: NDArray[np.uint8], fps: int = 10) -> bytes:
     return encode_frames(frames, frames.shape[1:3], VIDEO, fps, keyframes=KEYFRAMES)
 
 
-def encode_masks(masks: NDArray[np.uint8], fps: int = 10) -> bytes:
+def encode_masks(masks: NDArray[np.uint8], fps: float = 10) -> bytes:
     """Lossless Matroska bytes of instance ids ``[T, H, W]`` uint8.
 
     Raises:
@@ -123,7 +125,7 @@ def decode_masks(data: bytes) -> NDArray[np.uint8]:
 
 
 def write_mp4(
-    target: Path | IO[bytes], frames: Iterable[NDArray[np.uint8]], fps: int = 10, scale: int = 1
+    target: Path | IO[bytes], frames: Iterable[NDArray[np.uint8]], fps: float = 10, scale: int = 1
 ) -> None:
     """Write frames as an MP4 (H.264, yuv420p) that every browser plays.
 
@@ -142,7 +144,7 @@ def write_mp4(
     if first is None:
         raise ShapeError("a video needs at least one frame")
     frames = itertools.chain([first], even)
-    data = encode_frames(frames, first.shape[:2], MP4, fps, keyframes=5 * fps)
+    data = encode_frames(frames, first.shape[:2], MP4, fps, keyframes=math.ceil(5 * fps))
     if isinstance(target, Path):
         with written_whole(target) as partial:
             partial.write_bytes(data)
@@ -161,7 +163,7 @@ def encode_frames(
     images: Iterable[NDArray[np.uint8]],
     size: Sequence[int],
     encoding: Encoding,
-    fps: int,
+    fps: float,
     keyframes: int,
 ) -> bytes:
     """Encode images of height and width `size` in one thread.
@@ -171,7 +173,7 @@ def encode_frames(
     buffer = io.BytesIO()
     output: Any  # PyAV's annotations leave half of their types open
     with av.open(buffer, "w", format=encoding.container, options={"fflags": "+bitexact"}) as output:
-        stream = output.add_stream(encoding.codec, rate=fps)
+        stream = output.add_stream(encoding.codec, rate=exact_rate(fps))
         stream.height, stream.width = size
         stream.pix_fmt = encoding.stored
         stream.options = dict(encoding.options)

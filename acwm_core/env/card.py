@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from fractions import Fraction
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from acwm_core.env.episode import Episode, Factor
 from acwm_core.errors import ShapeError, expect
 
-ActionKind = Literal["absolute", "delta", "torque"]
-"""What an action commands: a position, a change of position, or a force or torque."""
+ActionKind = Literal["absolute", "delta", "velocity", "torque"]
+"""What an action commands: a position, a change of position, a speed, or a force or torque."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class ActionSpec:
         units: one per dimension, e.g. ``("m", "m")``; ``""`` for a pure number.
         low: lower bounds in these units; models use the bounds to normalise actions to [-1, 1].
         high: upper bounds.
-        kind: what an action commands: ``"absolute"``, ``"delta"`` or ``"torque"`` (also forces).
+        kind: what an action commands: ``"absolute"``, ``"delta"``, ``"velocity"`` or ``"torque"``
+            (also forces).
 
     Raises:
         ShapeError: the lengths differ, or a lower bound is not below its upper bound.
@@ -82,7 +84,7 @@ class EnvironmentCard:
         summary: one sentence.
         action: meaning and bounds of the action.
         frame_size: default ``(H, W)``.
-        fps: frames, and so actions, per second.
+        fps: frames, and so actions, per second; a whole rate is an integer. See `exact_rate`.
         horizon: number of frames of an episode, T.
         factors: the factors of variation.
         ood_shifts: names of the factors that `ood_test` shifts, one per episode in turn.
@@ -92,13 +94,14 @@ class EnvironmentCard:
         episodes: number of episodes per split in the full benchmark.
         variants: other registered names that are variants of this environment.
         citation: source of the task.
+        views: names of the cameras, from left to right, if a frame shows several of equal width.
     """
 
     name: str
     summary: str
     action: ActionSpec
     frame_size: tuple[int, int]
-    fps: int
+    fps: float
     horizon: int
     factors: tuple[Factor, ...]
     ood_shifts: tuple[str, ...]
@@ -108,10 +111,15 @@ class EnvironmentCard:
     episodes: Mapping[str, int] = field(default_factory=dict[str, int])
     variants: tuple[str, ...] = ()
     citation: str = ""
+    views: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fps", plain_rate(self.fps))
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
-        return asdict(self)
+        values = asdict(self)
+        return values if self.views else {k: v for k, v in values.items() if k != "views"}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
@@ -122,6 +130,29 @@ class EnvironmentCard:
         values["state"] = tuple(StateField(**_fields(f)) for f in fields["state"])
         values["episodes"] = dict(fields.get("episodes", {}))
         return cls(**values)
+
+
+def exact_rate(fps: float | Fraction) -> Fraction:
+    """The rate that a card's `fps` stands for, e.g. 30000/1001 for 29.97002997…"""
+    return Fraction(fps).limit_denominator(100_000)
+
+
+def plain_rate(fps: float | Fraction | str) -> float:
+    """A rate as a card has it: an integer if it is whole, else a float.
+
+    Args:
+        fps: frames per second; a text may be ``30000/1001``.
+
+    Raises:
+        ShapeError: it is no positive number.
+    """
+    try:
+        rate = exact_rate(Fraction(fps if isinstance(fps, str | Fraction) else float(fps)))
+    except (ValueError, OverflowError, ZeroDivisionError, TypeError):
+        rate = Fraction(0)
+    if rate <= 0:
+        raise ShapeError(f"{fps!r} is no rate: give frames per second, such as 30 or 30000/1001")
+    return rate.numerator if rate.denominator == 1 else float(rate)
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:
@@ -155,11 +186,20 @@ def _check_actions(actions: NDArray[np.float32], spec: ActionSpec) -> None:
     expect(actions.dtype == np.float32, f"actions are {actions.dtype}")
     expect(actions.shape[1:] == (spec.size,), f"actions are {actions.shape}")
     expect(np.all(np.isfinite(actions)), "an action is not finite")
-    least, most = np.array(spec.low), np.array(spec.high)
-    slack = 1e-6 * (most - least)  # float32 rounding of a bound is no violation
-    taken = actions[:-1].astype(np.float64)
-    bounded = np.all((taken >= least - slack) & (taken <= most + slack))
-    expect(bounded, "an action is out of bounds")
+    beyond = out_of_bounds(actions[:-1], spec)
+    expect(not beyond, beyond)
+
+
+def out_of_bounds(actions: NDArray[Any], spec: ActionSpec) -> str:
+    """Which of the actions ``[N, A]`` lies beyond which bound, for a message; empty if none."""
+    taken, low, high = actions.astype(np.float64), np.array(spec.low), np.array(spec.high)
+    slack = 1e-6 * (high - low)  # float32 rounding of a bound is no violation
+    outside = (taken < low - slack) | (taken > high + slack)
+    if not outside.any():
+        return ""
+    row, column = np.argwhere(outside)[0]
+    value, bounds = taken[row, column], f"[{low[column]:g}, {high[column]:g}]"
+    return f"the action {spec.names[column]} is {value:g} in row {row}, out of its bounds {bounds}"
 
 
 def _fields(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -158,7 +158,7 @@ class SampleVideos(Callback):
     """
 
     def __init__(
-        self, run: RunFolder, every_n_steps: int, video: Tensor, actions: Tensor, fps: int
+        self, run: RunFolder, every_n_steps: int, video: Tensor, actions: Tensor, fps: float
     ) -> None:
         self._run, self._every_n_steps, self._fps = run, every_n_steps, fps
         self._video, self._actions = video, actions
@@ -241,7 +241,7 @@ class ValidationRollouts(Callback):
         pl_module.log("val/psnr_over_first_frame", psnr - still, sync_dist=True)
 
 
-def encode_gif(truth: Video, predicted: Video, fps: int) -> bytes:
+def encode_gif(truth: Video, predicted: Video, fps: float) -> bytes:
     """An endlessly looping GIF: one row per clip, truth on the left."""
     pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
     frames = (pairs.permute(1, 0, 3, 4, 2).flatten(1, 2) * 255).round().to(torch.uint8)

@@ -36,7 +36,8 @@ class Alignment:
         max_gap: how many missing frames or actions in a row are filled with what was before; as
             many are left out at either end.
         shift: by how many frames actions are moved; a positive number moves them to later frames.
-        kinds: what each dimension of the actions commands, or all of them. It decides what becomes
+        kinds: what each dimension of the actions commands, or all of them, as the recordings say
+            by default. It decides what becomes
             of actions between two frames: they are held, averaged or summed.
         on_defect: what becomes of a recording with a defect. ``trim`` keeps its sound parts.
     """
@@ -45,7 +46,7 @@ class Alignment:
     tolerance: float = 0.25
     max_gap: int = 2
     shift: int = 0
-    kinds: tuple[ActionKind, ...] = ("absolute",)
+    kinds: tuple[ActionKind, ...] = ()
     on_defect: OnDefect = "refuse"
 
 
@@ -141,11 +142,12 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
             return found
         measured = cadence(main.times)
         found.rate, found.seconds = measured.rate, float(main.times[-1] - main.times[0])
-        _compare(found, recording, measured, options)
+        said = _compare(found, recording, measured, options)
         grid = _grid(found, main, measured, options)
         rows = _Rows(found, main.times, measured)
         actions = rows.stream("action", _rows_of(recording.actions), last=False)
         states = {n: rows.stream(n, samples) for n, samples in recording.states.items()}
+        grid = _Grid(grid.times[grid.times < main.times[said]], grid.step) if said else grid
         _plan(found, grid, frames, actions, states, options)
     except DataError as error:
         found.episodes.clear()
@@ -168,14 +170,15 @@ def _sound(found: Aligned, what: str, stream: _Stream) -> _Stream:
 
 def _compare(
     found: Aligned, recording: TimedRecording, measured: Cadence, options: Alignment
-) -> None:
-    """Compare what the source claims with what its frames show."""
+) -> int | None:
+    """Compare what the source claims with what its frames show; says how many of them count."""
     said, count, slots = recording.length, len(measured.slots), measured.places
     if said is not None and said not in (count, slots, slots + measured.late):
         found.found(f"it is said to have {said} frames, and has {count}")
     if recording.rate and options.fps is None and not measured.is_at(recording.rate):
         rates = f"{float(recording.rate):g} frames/s, and has {measured.rate:.4g}"
         found.found(f"it is said to have {rates}", "--fps")
+    return said if said is not None and 2 <= said < count else None
 
 
 def _grid(found: Aligned, frames: _Stream, measured: Cadence, options: Alignment) -> _Grid:
@@ -362,7 +365,8 @@ def _acted(
     taken = taken.astype(np.float64)
     step = actions.step or grid.step
     if abs(step / grid.step - 1) > SAME + options.tolerance / len(grid.times):
-        kinds = options.kinds * (taken.shape[1] if len(options.kinds) == 1 else 1)
+        kinds = options.kinds or ("absolute",)
+        kinds = kinds * (taken.shape[1] if len(kinds) == 1 else 1)
         if len(kinds) != taken.shape[1]:
             raise DataError(f"its actions have {taken.shape[1]} dimensions, not {len(kinds)}")
         sums = _summed(actions, grid)

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.env.card import plain_rate
 from acwm_core.env.environment import ActionSpec, StateField
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError, suggest
-from acwm_formats.recordings import (
+from acwm_formats.alignment import Alignment
+from acwm_formats.reading import ImportOptions
+from acwm_formats.recordings import import_dataset
+from acwm_formats.timeline import (
+    ActionFacts,
     RecordedDataset,
     Recording,
     Recordings,
-    import_dataset,
-    recorded_card,
+    Samples,
+    TimedRecording,
 )
-from acwm_formats.video import shrunk, target_size
 
 __all__ = ["Recording", "write_dataset"]
 
@@ -31,10 +35,11 @@ def write_dataset(
     *,
     name: str,
     action: ActionSpec,
-    fps: int,
+    fps: float | Fraction,
     state: Mapping[str, str] | None = None,
     size: int | tuple[int, int] | None = None,
     summary: str = "",
+    alignment: Alignment | None = None,
     workers: int = 0,
     progress: bool = True,
 ) -> DatasetCard:
@@ -46,11 +51,12 @@ def write_dataset(
             ``__getitem__`` that reads each one on demand.
         name: name of the environment that they show, one word.
         action: names, units and bounds of the action.
-        fps: frames (and so actions) per second.
+        fps: frames (and so actions) per second, e.g. 30 or ``Fraction(30000, 1001)``.
         state: unit of each array to keep from `Recording.states`, by name; none by default.
         size: frame size, a side or ``(H, W)``; larger frames are averaged down. By default the size
             of the first recording, each side rounded down to a multiple of 8.
         summary: one sentence about the data.
+        alignment: what to do about arrays that do not fit together; by default they are refused.
         workers: number of processes to read and encode in; they require picklable `splits`.
         progress: whether to show a progress bar on the terminal.
 
@@ -59,6 +65,7 @@ def write_dataset(
 
     Raises:
         DataError: a recording is invalid, or the folder holds another dataset.
+        ShapeError: the rate or the size is not possible.
     """
     for split in splits:
         if split not in SPLITS:
@@ -66,49 +73,35 @@ def write_dataset(
     ends = {s: (splits[s][0], splits[s][len(splits[s]) - 1]) for s in splits if len(splits[s])}
     if not ends:
         raise DataError("there are no recordings to write")
-    first = next(iter(ends.values()))[0]
-    card = recorded_card(
+    first, rate = next(iter(ends.values()))[0], plain_rate(fps)
+    sums = {split: [_digest(recording) for recording in pair] for split, pair in ends.items()}
+    recorded = RecordedDataset(
         name,
-        action,
-        frame_size=target_size((first.video.shape[1], first.video.shape[2]), size),
-        fps=fps,
-        horizon=max(recording.frames for pair in ends.values() for recording in pair),
-        state=[_field(first, field, unit) for field, unit in (state or {}).items()],
+        splits,
+        {"kind": "python", "name": name, "sha256_of_first_and_last": sums},
+        fps=rate,
+        actions=ActionFacts(action.names, action.units, action.kind, (action.low, action.high)),
+        state=tuple(_field(first, field, unit) for field, unit in (state or {}).items()),
+        costly=True,
         summary=summary,
     )
-    sums = {split: [_digest(recording) for recording in pair] for split, pair in ends.items()}
-    facts = {"kind": "python", "name": name, "sha256_of_first_and_last": sums}
-    recorded = RecordedDataset(
-        card, {split: _Shrunk(splits[split], card.frame_size) for split in splits}, facts
-    )
-    return import_dataset(recorded, out, workers=workers, progress=progress)
+    options = ImportOptions(size=size, alignment=alignment or Alignment())
+    return import_dataset(recorded, out, options, workers=workers, progress=progress)
 
 
-def _field(recording: Recording, name: str, unit: str) -> StateField:
+def _field(recording: Recording | TimedRecording, name: str, unit: str) -> StateField:
     if name not in recording.states:
         raise DataError(f"recordings have no state {name!r}{suggest(name, recording.states)}")
-    return StateField(name, np.asarray(recording.states[name]).shape[1:], unit, "as recorded")
+    rows = recording.states[name]
+    values = rows.values if isinstance(rows, Samples) else rows
+    return StateField(name, np.shape(values)[1:], unit, "as recorded")
 
 
-def _digest(recording: Recording) -> str:
+def _digest(recording: Recording | TimedRecording) -> str:
     digest = hashlib.sha256()
-    for array in (recording.video, recording.actions, *recording.states.values()):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    if isinstance(recording, Recording):
+        for array in (recording.video, recording.actions, *recording.states.values()):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    else:
+        digest.update(np.ascontiguousarray(recording.actions.values).tobytes())
     return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class _Shrunk:
-    """Recordings whose frames are averaged down to `size`."""
-
-    recordings: Recordings
-    size: tuple[int, int]
-
-    def __len__(self) -> int:
-        return len(self.recordings)
-
-    def __getitem__(self, index: int) -> Recording:
-        recording = self.recordings[index]
-        if recording.video.shape[1:3] == self.size:
-            return recording
-        return replace(recording, video=shrunk(recording.video, self.size))

@@ -15,13 +15,15 @@ import numpy as np
 from acwm_core.checks.result import NotTried, Suite, expect, expect_is_a
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.env.environment import ActionSpec
 from acwm_formats.check import check_dataset
 from acwm_formats.format import Format, export_dataset, options_of
-from acwm_formats.recordings import RecordedDataset, Recording, import_dataset, recorded_card
+from acwm_formats.options import NAMES
+from acwm_formats.reading import divided, episode_name, opened
+from acwm_formats.recordings import import_dataset
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Recording, TimedRecording
 
 MIN_PSNR = 25.0  # in dB; lossy video of smooth frames has more
-TAKEN = {"out", "workers", "data"}  # options that the commands define themselves
+TAKEN = {"out", "workers", "data", *NAMES}  # options that the commands define themselves
 
 
 class FormatChecks(Suite):
@@ -46,11 +48,11 @@ class FormatChecks(Suite):
     @functools.cached_property
     def _exported(self) -> Path:
         """The folder of waves as it writes them; those that it should be are beside it."""
-        action = ActionSpec(("x", "y"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "delta")
-        card = recorded_card("waves", action, frame_size=(32, 48), fps=10, horizon=8)
+        actions = ActionFacts(("x", "y"), kind="delta", bounds=((-1.0, -1.0), (1.0, 1.0)))
         splits: Any = {"train": [_waves(0), _waves(1)], "ind_test": [_waves(2)]}
         facts = {"kind": "example", "name": "waves"}
-        _imported(RecordedDataset(card, splits, facts), self._folder / "waves")
+        waves = RecordedDataset("waves", splits, facts, fps=10, actions=actions)
+        _imported(waves, self._folder / "waves")
         return self._export("one")
 
     def _export(self, name: str) -> Path:
@@ -123,16 +125,20 @@ class FormatChecks(Suite):
 
 def _read_backwards(recorded: RecordedDataset) -> None:
     """Check that recordings do not depend on reading order: workers read copies, in any order."""
-    for split, recordings in recorded.splits.items():
+    for split, (recordings, places) in divided(recorded, None).items():
         copy = pickle.loads(pickle.dumps(recordings))
-        for index in reversed(range(len(recordings))):
-            pairs = zip(_arrays(recordings[index]), _arrays(copy[index]), strict=True)
-            same = all(np.array_equal(one, other) for one, other in pairs)
+        for index in reversed(places):
+            name = episode_name(split, index)
+            one, other = (_arrays(opened(each, index, name, 1.0)) for each in (recordings, copy))
+            same = all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
             expect(same, f"recording {index} of {split} is another when it is read first")
 
 
-def _arrays(recording: Recording) -> list[Any]:
-    return [recording.video, recording.actions, *recording.states.values()]
+def _arrays(recording: TimedRecording) -> list[Any]:
+    arrays = [recording.actions.values, *(rows.values for rows in recording.states.values())]
+    for frames in recording.cameras.values():
+        arrays += [frames.times, *([] if frames.depth else frames.read(range(len(frames.times))))]
+    return arrays
 
 
 def _imported(recorded: RecordedDataset, out: Path) -> DatasetCard:
@@ -146,9 +152,9 @@ def _waves(seed: int) -> Recording:
     return Recording(video, np.random.default_rng(seed).uniform(-1, 1, (5 + seed, 2)))
 
 
-def _datasets(found: Any) -> Mapping[str, RecordedDataset]:
+def _datasets(found: Any) -> dict[str, RecordedDataset]:
     if isinstance(found, Mapping):
-        return cast(Mapping[str, RecordedDataset], found)
+        return dict(cast(Mapping[str, RecordedDataset], found))
     expect_is_a(found, RecordedDataset)
     return {".": found}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, cast, get_args, get_origin
@@ -13,6 +14,7 @@ import click
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
 from acwm_core.cli.tables import plain_table
 from acwm_core.errors import DataError, unknown_name
+from acwm_formats.options import OPTIONS, import_options
 
 if TYPE_CHECKING:
     from acwm_core.plugins import Registry
@@ -80,11 +82,10 @@ def _print_facts(facts: dict[str, Any]) -> None:
 
     height, width = facts["frame_size"]
     click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
-    click.echo(f"{height}×{width} at {facts['fps']} fps, {facts['horizon']} frames per episode")
+    click.echo(f"{height}×{width} at {facts['fps']:.6g} fps, {facts['horizon']} frames per episode")
     if facts["source"]:
         click.echo(f"recorded: {facts['source']['name']} ({facts['source']['kind']})")
-        for note in facts["source"].get("notes", ()):
-            click.echo(f"  {note}")
+        _print_notes(facts["source"])
     else:
         click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
         if facts["exploration"]:
@@ -98,6 +99,13 @@ def _print_facts(facts: dict[str, Any]) -> None:
     for split, each in facts["splits"].items():
         for label, count in each.get("ood_labels", {}).items():
             click.echo(f"{split}: {count} episodes shift {label}")
+
+
+def _print_notes(source: Mapping[str, Any]) -> None:
+    for note in source.get("notes", ()):
+        click.echo(f"  {note}")
+    for problem in source.get("skipped", ()):
+        click.echo(f"  left out: {problem}")
 
 
 class FormatGroup(click.Group):
@@ -215,23 +223,29 @@ def _click_type(annotation: Any) -> Any:
 @click.command("import")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
 @click.option("--workers", type=int, help="Processes; one per core by default, 0 for none.")
-def import_format(source: Format, given: dict[str, Any], out: Path, workers: int | None) -> None:
+def import_format(
+    source: Format, given: dict[str, Any], out: Path, workers: int | None, **asked: Any
+) -> None:
     """Import recordings in another format as a dataset.
 
     Without FORMAT or --format FORMAT, the format is found out from the files. If it is interrupted,
     run the same command again to continue.
     """
-    from acwm_formats.recordings import RecordedDataset, import_dataset
+    from acwm_formats.recordings import import_dataset
+    from acwm_formats.timeline import RecordedDataset
 
+    options = import_options(**asked)
     found = source.read(**given)
     several = {".": found} if isinstance(found, RecordedDataset) else found
     for name, recorded in several.items():
-        card = import_dataset(recorded, out / name, workers=workers)
+        card = import_dataset(recorded, out / name, options, workers=workers)
         made = ", ".join(f"{count} {split}" for split, count in card.splits.items())
         click.echo(f"{out / name} holds {made} episodes of {card.environment.name}")
-        for note in card.source["notes"]:
-            click.echo(f"  {note}")
+        _print_notes(card.source)
         click.echo(f"next: acwm fit small data.path={out / name}")
+
+
+import_format.params += OPTIONS
 
 
 @click.command("export")

@@ -12,11 +12,10 @@ from __future__ import annotations
 
 import inspect
 import re
-import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
@@ -26,7 +25,7 @@ from acwm_core.errors import DataError, MissingExtraError
 from acwm_core.executors import progress_bar
 from acwm_core.files import made_whole, writing
 from acwm_core.plugins import catalog
-from acwm_formats.recordings import RecordedDataset
+from acwm_formats.timeline import RecordedDataset
 
 
 class Export(NamedTuple):
@@ -61,6 +60,9 @@ class Format(ABC):
 
     def read(self, *source: Any, **options: Any) -> RecordedDataset | Mapping[str, RecordedDataset]:
         """Return the dataset to import, or several, keyed by the subfolder of ``--out`` to fill.
+
+        What every import has, such as frame size, cameras and rate, is not its business: see
+        `acwm_formats.reading.ImportOptions`.
 
         Args:
             source: what to read, usually the one path that `detect` knows.
@@ -144,16 +146,6 @@ def export_dataset(
     with writing(out), made_whole(out) as partial, bar as report:
         target.write(Export(card, splits, partial, lambda: report(1)), **options)
     return out
-
-
-def import_command(kind: str, name: str, **options: object) -> str:
-    """The command ``acwm data import KIND NAME --option value …``; options of None are left out."""
-    words = ["acwm", "data", "import", kind, name]
-    for option, value in options.items():
-        if value is not None:
-            size = "x".join(map(str, cast(Any, value))) if isinstance(value, tuple) else value
-            words += [f"--{option.replace('_', '-')}", str(size)]
-    return shlex.join(words)
 
 
 def options_of(method: Callable[..., Any]) -> list[tuple[inspect.Parameter, str]]:

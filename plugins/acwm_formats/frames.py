@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import av
 import numpy as np
@@ -61,18 +61,20 @@ class VideoFrames:
     Attributes:
         path: an MP4, MOV, MKV, WebM, AVI or GIF file, told by its first bytes. FFmpeg's playlists
             are refused, as they can name other files.
+        origin: where the recording's clock begins, in seconds of the file.
         unit: metres per number, if it is a depth map.
     """
 
     path: Path
     first: int = 0
     stop: int | None = None
+    origin: float = 0.0
     unit: float = MILLIMETRE
 
     @property
     def times(self) -> NDArray[np.float64]:
         """As in `Frames`."""
-        return video_index(self.path).times[self.first : self.stop]
+        return video_index(self.path).times[self.first : self.stop] - self.origin
 
     @property
     def size(self) -> tuple[int, int]:
@@ -221,13 +223,24 @@ def _at(index: VideoIndex, tick: int) -> str:
     return f"at {float(tick * index.base):.3f} s"
 
 
+class Images(Protocol):
+    """Images by index: a list, an array, or an object that reads them on request."""
+
+    def __len__(self) -> int:
+        """Number of images."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Any:
+        """An array, the path of a picture, or the bytes of one."""
+        ...
+
+
 @dataclass(frozen=True)
 class ImageFrames:
     """Frames in memory or in files of pictures, with times of their own; see `Frames`.
 
     Attributes:
-        images: for each frame an array, the path of a picture, or the bytes of one. A sequence that
-            reads them on request keeps memory small.
+        images: one for each frame.
         times: ``[N]`` in seconds.
         pixel_range: the values that are black and white, see `to_rgb`; guessed from the first image
             by default.
@@ -235,7 +248,7 @@ class ImageFrames:
         stamp: as in `Frames`.
     """
 
-    images: Sequence[Any]
+    images: Images
     times: NDArray[np.float64]
     pixel_range: tuple[float, float] | None = None
     unit: float = MILLIMETRE

@@ -29,7 +29,7 @@ from acwm_formats.lerobot_layout import (
     parquet,
 )
 from acwm_formats.statistics import Stats, colour_statistics, combined, plain, statistics
-from acwm_formats.video import VideoWriter
+from acwm_formats.video_writer import VideoWriter
 
 CAMERA = "observation.images.main"
 STATE = "observation.state"

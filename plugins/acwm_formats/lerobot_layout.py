@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import re
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -49,15 +49,16 @@ class Place(NamedTuple):
         episode: number of the episode.
         length: number of its frames.
         data: the parquet file with its rows.
-        video: the file with its frames; None if the frames are in the rows.
-        start: where the episode starts in that file, in seconds.
+        videos: for each camera whose frames are not in the rows, the file with its frames, and at
+            which second of it the episode starts.
+        tasks: what was to be done.
     """
 
     episode: int
     length: int
     data: Path
-    video: Path | None
-    start: float
+    videos: dict[str, tuple[Path, float]]
+    tasks: tuple[str, ...] = ()
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -93,36 +94,38 @@ def read_card(root: Path) -> EnvironmentCard | None:
         raise DataError(f"{root / CARD} is not a card ({type(error).__name__}: {error})") from error
 
 
-def read_places(root: Path, camera: str) -> list[Place]:
+def read_places(root: Path) -> list[Place]:
     """Read the location of every episode, in order of their numbers.
 
     Raises:
         DataError: the location of an episode is missing, damaged or leads out of `root`.
     """
     info = read_info(root)
-    in_video = info["features"][camera].get("dtype") == "video"
+    filmed = [n for n, feature in info["features"].items() if feature.get("dtype") == "video"]
     rows = _rows(root) if info["codebase_version"] == VERSION else _old_rows(root, info)
     try:
-        places = [_place(root, info, camera, row, in_video) for row in rows]
+        places = [_place(root, info, filmed, row) for row in rows]
     except (KeyError, TypeError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"{root / 'meta'} does not say where episodes lie ({reason})") from error
-    places.sort()
+    places.sort(key=lambda place: place.episode)
     if [place.episode for place in places] != list(range(len(places))):
         raise DataError(f"{root / 'meta'} does not number its episodes from 0 without a gap")
     return places
 
 
-def read_columns(path: Path, names: list[str], episode: int | None = None) -> Any:
-    """Read columns of a parquet file, of one episode or all, as a table in frame order.
+def read_columns(path: Path, names: list[str], episode: int) -> Any:
+    """Read columns of an episode from a parquet file, as a table in frame order.
 
     Raises:
         DataError: the file is missing or damaged, or has no such column.
     """
     order = ["episode_index", "frame_index"]
-    filters = None if episode is None else [("episode_index", "==", episode)]
+    filters = [("episode_index", "==", episode)]
     try:
-        table = parquet.read_table(path, columns=[*order, *names], filters=filters)
+        table = parquet.read_table(
+            path, columns=list(dict.fromkeys([*order, *names])), filters=filters
+        )
         return table.sort_by([(name, "ascending") for name in order]).select(names)
     except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
         raise _unreadable(path, error) from error
@@ -171,24 +174,26 @@ def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _place(
-    root: Path, info: Mapping[str, Any], camera: str, row: Mapping[str, Any], in_video: bool
+    root: Path, info: Mapping[str, Any], filmed: Sequence[str], row: Mapping[str, Any]
 ) -> Place:
     episode, length = int(row["episode_index"]), int(row["length"])
+    tasks = tuple(map(str, row.get("tasks") or ()))
+    videos: dict[str, tuple[Path, float]] = {}
     if "chunk" in row:  # version 2
-        names = {"episode_chunk": row["chunk"], "episode_index": episode, "video_key": camera}
-        data = _path(root, info["data_path"], names)
-        video = _path(root, info["video_path"], names) if in_video else None
-        return Place(episode, length, data, video, 0.0)
+        names = {"episode_chunk": row["chunk"], "episode_index": episode}
+        for camera in filmed:
+            path = _path(root, info["video_path"], {**names, "video_key": camera})
+            videos[camera] = path, 0.0
+        return Place(episode, length, _path(root, info["data_path"], names), videos, tasks)
 
     def numbers(prefix: str) -> dict[str, Any]:
-        keys = ("chunk_index", "file_index")
-        return {key: int(row[f"{prefix}/{key}"]) for key in keys} | {"video_key": camera}
+        return {key: int(row[f"{prefix}/{key}"]) for key in ("chunk_index", "file_index")}
 
-    data, key = _path(root, info["data_path"], numbers("data")), f"videos/{camera}"
-    if not in_video:
-        return Place(episode, length, data, None, 0.0)
-    video = _path(root, info["video_path"], numbers(key))
-    return Place(episode, length, data, video, float(row[f"{key}/from_timestamp"]))
+    for camera in filmed:
+        key = f"videos/{camera}"
+        path = _path(root, info["video_path"], {**numbers(key), "video_key": camera})
+        videos[camera] = path, float(row[f"{key}/from_timestamp"])
+    return Place(episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks)
 
 
 def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import itertools
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from acwm_core.data.video import write_mp4
-from acwm_core.env.environment import ActionSpec, EnvironmentCard
+from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.plugins import catalog
 from acwm_formats.example import exported_example
-from acwm_formats.format import Export, Format, import_command
+from acwm_formats.format import Export, Format
+from acwm_formats.frames import VideoFrames
 from acwm_formats.published_layout import (
     CITATION,
     ENVIRONMENTS,
@@ -32,12 +32,10 @@ from acwm_formats.published_layout import (
     Entry,
     read_entries,
 )
-from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
-from acwm_formats.video import shrunk, target_size, video_facts, video_frames
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 LARGE = 1024  # square videos of this side are averaged down to `USUAL` by default
 USUAL = 240
-FPS = 10  # for videos without a frame rate
 OTHERS = "others"  # category of environments that are not in the release
 
 
@@ -54,13 +52,7 @@ class Published(Format):
             for place in path.glob(f"{below}{name}")
         )
 
-    def read(
-        self,
-        root: Path,
-        *,
-        size: int | tuple[int, int] | None = None,
-        environment: str | None = None,
-    ) -> RecordedDataset | dict[str, RecordedDataset]:
+    def read(self, root: Path) -> RecordedDataset | dict[str, RecordedDataset]:
         """Import the published ACWM-Phys release.
 
         ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several
@@ -70,22 +62,14 @@ class Published(Format):
         Args:
             root: the folder of one environment, with some of ``ind_train``, ``ind_test`` and
                 ``ood_test`` in it, or a folder one or two levels above.
-            size: Frame size, 64 or HEIGHTxWIDTH; by default that of the videos.
-            environment: Name of the environment.
         """
         root = Path(root)
         if _splits(root):
-            return _dataset(root, size, environment)
-        folders = _folders(root)
-        if environment and len(folders) > 1:
-            raise DataError(
-                f"{root} holds {len(folders)} environments: give --environment for one "
-                "folder at a time"
-            )
+            return _dataset(root)
         found: dict[str, RecordedDataset] = {}
-        for folder in folders:
-            dataset = _dataset(folder, size, environment)
-            name = dataset.environment.name
+        for folder in _folders(root):
+            dataset = _dataset(folder)
+            name = dataset.name
             if name in found:
                 raise DataError(f"{folder} is a second {name}: import one folder at a time")
             found[name] = dataset
@@ -129,61 +113,56 @@ class Published(Format):
         return {"root": exported_example(folder, cls())}
 
 
-def _dataset(
-    folder: Path, size: int | tuple[int, int] | None, environment: str | None
-) -> RecordedDataset:
+def _dataset(folder: Path) -> RecordedDataset:
     """The dataset of one environment."""
     places = _splits(folder)
     entries: dict[Split, list[Entry]] = {s: read_entries(places[s] / METADATA) for s in places}
-    split = next(iter(places))
-    video = video_facts(places[split] / entries[split][0].video)
-    if size is None and video.size == (LARGE, LARGE):
-        size = USUAL
     name = folder.resolve().name
-    meaning = _meaning(environment or _environment_name(name), entries)
-    card = recorded_card(
+    meaning = _meaning(_environment_name(name), entries)
+    split = next(iter(places))
+    first = VideoFrames(places[split] / entries[split][0].video)
+    return RecordedDataset(
         meaning.name,
-        meaning.action,
-        frame_size=target_size(video.size, size),
-        fps=round(video.fps) or FPS,
-        horizon=max(_nominal(entry) for each in entries.values() for entry in each),
+        {s: PublishedRecordings(place, len(entries[s])) for s, place in places.items()},
+        {
+            "kind": "acwm-phys",
+            "name": name,
+            "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
+        },
+        options={},
+        actions=meaning.actions,
+        size=USUAL if _side(first) == (LARGE, LARGE) else None,
+        notes=(*meaning.notes, *_notes(places, entries)),
         summary=meaning.summary,
         citation=meaning.citation,
     )
-    options = {"environment": environment, "size": card.frame_size}
-    facts = {
-        "kind": "acwm-phys",
-        "name": name,
-        "command": import_command("acwm-phys", name, **options),
-        "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
-    }
-    return RecordedDataset(
-        card,
-        {s: PublishedRecordings(place, len(entries[s]), card) for s, place in places.items()},
-        facts,
-        notes=(*meaning.notes, *_notes(places, entries)),
-        nominal={s: [entry.length for entry in entries[s]] for s in places},
-    )
+
+
+def _side(frames: VideoFrames) -> tuple[int, int] | None:
+    """The size of frames; None if they cannot be read, which the import tells."""
+    try:
+        return frames.size
+    except (DataError, OSError):
+        return None
 
 
 @dataclass(frozen=True)
 class PublishedRecordings:
-    """The episodes in the folder of one split, read on demand."""
+    """The episodes in the folder of one split, opened on request."""
 
     folder: Path
     count: int
-    card: EnvironmentCard
 
     def __len__(self) -> int:
         """The number of episodes."""
         return self.count
 
-    def __getitem__(self, index: int) -> Recording:
-        """Decode an episode; its length is the shortest of video, actions and nominal length."""
+    def __getitem__(self, index: int) -> TimedRecording:
+        """Open an episode, without decoding its frames."""
         entry = _entries(self.folder / METADATA)[index]
-        nominal = itertools.islice(video_frames(self.folder / entry.video), _nominal(entry))
-        video = shrunk(nominal, self.card.frame_size)
-        return Recording(video, entry.actions[: len(video)])
+        frames = VideoFrames(self.folder / entry.video)
+        name = f"{self.folder.name}/{entry.video}"
+        return TimedRecording(name, {"video": frames}, Samples(entry.actions), length=entry.length)
 
 
 def _folders(root: Path) -> list[Path]:
@@ -196,10 +175,6 @@ def _folders(root: Path) -> list[Path]:
         f"{root} is not in the published layout: there is no {' or '.join(FOLDERS)} with a "
         f"{METADATA}, in it or in CATEGORY/ENVIRONMENT below it"
     )
-
-
-def _nominal(entry: Entry) -> int:
-    return min(entry.length, len(entry.actions))
 
 
 @functools.lru_cache(maxsize=1)
@@ -226,7 +201,7 @@ class _Meaning(NamedTuple):
     """The description of the environment."""
 
     name: str
-    action: ActionSpec
+    actions: ActionFacts
     summary: str
     citation: str
     notes: tuple[str, ...]
@@ -234,11 +209,8 @@ class _Meaning(NamedTuple):
 
 def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
     """Take the description from the registered environment if the sizes of its actions match."""
-    actions = [entry.actions for each in entries.values() for entry in each]
-    sizes = {rows.shape[1] for rows in actions}
-    if len(sizes) != 1:
-        raise DataError(f"the episodes have actions of different sizes: {sorted(sizes)}")
-    (size,) = sizes
+    sizes = Counter(entry.actions.shape[1] for each in entries.values() for entry in each)
+    size = sizes.most_common(1)[0][0]  # others are defects of their episodes
     known = next((card for card in _registered(name) if card.action.size == size), None)
     notes = ["Actions are as published, normalised to [-1, 1]: units are lost."]
     if known is None:
@@ -247,28 +219,19 @@ def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
         )
     elif known.name != name:
         notes.append(f"The actions are {size}-D: read as {known.name}, a variant of {name}.")
-    low, high = _bounds(actions)
-    if low.min() < -1 or high.max() > 1:
-        notes.append("Some actions exceed [-1, 1]; the bounds are those of the data.")
-    names = known.action.names if known else tuple(f"action_{i}" for i in range(size))
-    kind: Literal["absolute", "delta", "torque"] = known.action.kind if known else "absolute"
-    action = ActionSpec(names, ("",) * size, tuple(low.tolist()), tuple(high.tolist()), kind)
+    actions = ActionFacts(
+        known.action.names if known else tuple(f"action_{i}" for i in range(size)),
+        kind=known.action.kind if known else "absolute",
+        bounds=((-1.0,) * size, (1.0,) * size),
+        widened=True,
+    )
     return _Meaning(
         known.name if known else name,
-        action,
+        actions,
         known.summary if known else f"{name}, in the layout of ACWM-Phys",
         known.citation if known else CITATION,
         tuple(notes),
     )
-
-
-def _bounds(actions: list[NDArray[np.float32]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rows = [each for each in actions if len(each)]
-    if not rows:
-        raise DataError("no episode has an action")
-    low = np.min([each.min(0) for each in rows], axis=0).astype(np.float64)
-    high = np.max([each.max(0) for each in rows], axis=0).astype(np.float64)
-    return np.minimum(low, -1), np.maximum(high, 1)
 
 
 def _registered(name: str) -> list[EnvironmentCard]:

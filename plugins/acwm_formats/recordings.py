@@ -1,90 +1,53 @@
-"""Recorded episodes from any source, and how they are imported as a data folder."""
+"""Imports recordings as a data folder: looks at all, decodes the sound ones, fills shards."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+import shlex
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.card import DatasetCard, package_versions
-from acwm_core.data.dataset import Manifest
+from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.generate import fill
-from acwm_core.data.readme import write_readme
-from acwm_core.env.card import check_episode
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
-from acwm_core.env.episode import SPLITS, Episode, EpisodeSpec, Split
-from acwm_core.errors import AcwmError, DataError
-from acwm_core.executors import LocalExecutor
-from acwm_core.files import writing
+from acwm_core.env.card import ActionSpec, plain_rate
+from acwm_core.env.environment import EnvironmentCard, StateField
+from acwm_core.env.episode import SPLITS, Split
+from acwm_core.errors import DataError
+from acwm_core.executors import LocalExecutor, progress_bar
+from acwm_core.files import held, writing, written_whole
+from acwm_formats.alignment import Alignment, Defect
+from acwm_formats.bounds import action_bounds, beyond, outliers
+from acwm_formats.cadence import QUARTER, SAME, common_rate
+from acwm_formats.reading import (
+    ImportOptions,
+    Reading,
+    Scan,
+    ScanTask,
+    common_reading,
+    divided,
+    episode_name,
+    opened,
+    scan,
+    stated_rates,
+)
+from acwm_formats.staging import ORDER, STAGING, Staged, StagedEpisodes, StageTask, stage
+from acwm_formats.timeline import RecordedDataset, Recordings, TimedRecording
 
 UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
+MOST_TOLD = 50  # notes and defects that are told one by one
+ROWS = 1_000_000  # about how many rows of actions are looked at for their bounds
+AT_ONCE = 64  # recordings that one task looks at
 
-
-@dataclass(frozen=True)
-class Recording:
-    """The recorded data of one episode.
-
-    The arrays may differ in length; only the frames that all of them cover are kept.
-
-    Attributes:
-        video: ``[T, H, W, 3]`` uint8, with the frame size of the dataset.
-        actions: ``[T, A]`` or ``[T − 1, A]``; row i leads from frame i to frame i + 1, so a T-th
-            row leads to no frame and is dropped.
-        states: arrays of numbers by name, each ``[T, …]``.
-    """
-
-    video: NDArray[np.uint8]
-    actions: NDArray[np.floating[Any]]
-    states: Mapping[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
-
-    @property
-    def frames(self) -> int:
-        """Number of frames that all arrays cover."""
-        return min([len(self.video), len(self.actions) + 1, *map(len, self.states.values())])
-
-
-class Recordings(Protocol):
-    """Recordings by index, from 0: a list, or an object that reads them on request.
-
-    To be sent to workers, it must be picklable, importable and small.
-    """
-
-    def __len__(self) -> int:
-        """Number of recordings."""
-        ...
-
-    def __getitem__(self, index: int, /) -> Recording:
-        """Read one recording."""
-        ...
-
-
-@dataclass(frozen=True)
-class RecordedDataset:
-    """Recordings to import.
-
-    Attributes:
-        environment: the environment card of what they show; `recorded_card` makes one.
-        splits: the recordings of each split.
-        facts: `kind` and `name` of what is imported, and what identifies it, e.g. checksums. They
-            are kept in the card and compared when an import is resumed. They may include, for
-            people, the `command` that imports it, as `import_command` writes it.
-        notes: sentences for people, kept in the card.
-        seed: seed of the dataset, if the recordings were made with one.
-        nominal: number of frames that each recording of a split should have; those that have
-            fewer are counted in the notes.
-    """
-
-    environment: EnvironmentCard
-    splits: Mapping[Split, Recordings]
-    facts: Mapping[str, Any]
-    notes: tuple[str, ...] = ()
-    seed: int = 0
-    nominal: Mapping[Split, Sequence[int]] = field(default_factory=dict[Split, Sequence[int]])
+Parts = Mapping[Split, tuple[Recordings, Sequence[int]]]
+"""The recordings of each split, and the places in them of those that belong to it."""
 
 
 def recorded_card(
@@ -92,12 +55,13 @@ def recorded_card(
     action: ActionSpec,
     *,
     frame_size: tuple[int, int],
-    fps: int,
+    fps: float | Fraction,
     horizon: int,
     state: Sequence[StateField] = (),
     summary: str = "",
     engine: str = "recorded",
     citation: str = "",
+    views: tuple[str, ...] = (),
 ) -> EnvironmentCard:
     """The environment card of recorded data: no factors, one instance, no simulator."""
     return EnvironmentCard(
@@ -105,7 +69,7 @@ def recorded_card(
         summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {UNSEEN}".removeprefix(". "),
         action=action,
         frame_size=frame_size,
-        fps=fps,
+        fps=plain_rate(fps),
         horizon=horizon,
         factors=(),
         ood_shifts=(),
@@ -113,12 +77,14 @@ def recorded_card(
         instances=("unlabelled",),  # every pixel of the masks has id 0
         engine=engine,
         citation=citation,
+        views=views,
     )
 
 
 def import_dataset(
     recorded: RecordedDataset,
     out: str | Path,
+    options: ImportOptions | None = None,
     *,
     workers: int | None = None,
     shard_episodes: int = 32,
@@ -126,86 +92,353 @@ def import_dataset(
 ) -> DatasetCard:
     """Write recordings as the data folder `out`.
 
-    Finished shards are kept, so the same call resumes where a killed one ended. Each worker holds
-    one recording in memory at a time.
+    All recordings are looked at and decoded before anything is refused, so that all defects are in
+    one list. What was decoded is kept, so the same call goes on where a killed one ended, and so
+    does one with other options or after a file was removed.
 
     Args:
         recorded: what a format read, e.g. ``LeRobot().read(root)``.
+        options: what a user decides about it.
         workers: number of processes, one per core by default; 0 imports in this process.
 
     Returns:
         The card of the folder.
 
     Raises:
-        DataError: a recording cannot be read or does not match the card; the folder holds another
-            dataset or is in use.
+        DataError: recordings have defects and `options` do not say what to do about them; the
+            folder holds another dataset or is in use.
+        ShapeError: the frame size is not possible.
     """
-    out, environment = Path(out), recorded.environment
-    counts: dict[Split, int] = {s: len(recorded.splits.get(s, ())) for s in SPLITS}
-    wanted = DatasetCard(
-        environment=environment,
-        splits={split: count for split, count in counts.items() if count},
-        seed=recorded.seed,
-        options={"size": list(environment.frame_size)},
-        factors={},
-        shard_episodes=shard_episodes,
-        versions=package_versions(),
-        source=dict(recorded.facts),
-    )
-    if not wanted.splits:
+    options = options or ImportOptions()
+    if not options.alignment.kinds:
+        kinds = (recorded.actions.kind,)
+        options = replace(options, alignment=replace(options.alignment, kinds=kinds))
+    parts = divided(recorded, options.test_episodes)
+    if not parts:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
-    source = functools.partial(_recorded, environment, dict(recorded.splits))
-    made = fill(out, wanted, source, LocalExecutor(workers), progress=progress)
-    notes = [*recorded.notes]
-    for split, nominal in recorded.nominal.items():
-        lengths = [n for record in Manifest(out / split).ordered() for n in record.lengths]
-        if short := sum(n < said for n, said in zip(lengths, nominal, strict=True)):
-            counted = f"{short} of {len(lengths)} are shorter than they are said to be"
-            notes.append(f"{split}: {counted}")
-    made = replace(made, source={**made.source, "notes": notes})
-    with writing(out):
-        made.write(out)
-        write_readme(out, made)
-    return made
-
-
-def recorded_episode(recording: Recording, spec: EpisodeSpec, card: EnvironmentCard) -> Episode:
-    """Convert a recording to an `Episode`.
-
-    Raises:
-        DataError: it has fewer than two frames, or does not match the card.
-    """
-    frames = recording.frames
-    if frames < 2:
-        raise DataError(f"it has {frames} usable frames, and an action leads from one to another")
-    video = np.asarray(recording.video[:frames])
-    if video.dtype != np.uint8 or video.ndim != 4 or video.shape[3] != 3:
-        raise DataError(f"video is {video.dtype} {video.shape}, not uint8 [T, H, W, 3]")
-    actions = np.zeros((frames, card.action.size), np.float32)
-    given = np.asarray(recording.actions)
-    if given.ndim != 2 or given.shape[1] != card.action.size:
-        raise DataError(f"actions are {given.shape}, not [T, {card.action.size}]")
-    actions[:-1] = given[: frames - 1]
-    episode = Episode(
-        spec=spec,
-        video=video,
-        actions=actions,
-        states={name: np.asarray(rows[:frames]) for name, rows in recording.states.items()},
-        masks=np.zeros((frames, *card.frame_size), np.uint8),
-        contacts=np.zeros((0, 3), np.int32),
-        factors={},
-        ood_label=None,
+    first = _first(recorded, parts)
+    job = _Import(
+        recorded,
+        Path(out),
+        options,
+        parts,
+        first,
+        common_reading(recorded, first, options),
+        LocalExecutor(workers),
+        progress,
     )
-    check_episode(episode, card)
-    return episode
+    return job.run(shard_episodes)
 
 
-def _recorded(
-    card: EnvironmentCard, splits: Mapping[Split, Recordings], specs: Sequence[EpisodeSpec]
-) -> Iterator[Episode]:
-    for spec in specs:
-        try:
-            episode = recorded_episode(splits[spec.split][spec.index], spec, card)
-        except (AcwmError, OSError) as error:
-            raise DataError(f"episode {spec.index} of {spec.split}: {error}") from error
-        yield episode
+@dataclass(frozen=True)
+class _Import:
+    """One import: what was asked for, and the steps.
+
+    Attributes:
+        parts: the recordings of each split, and the places in them of those that belong to it.
+        first: a recording that can be opened.
+        reading: what all have in common with it.
+    """
+
+    recorded: RecordedDataset
+    out: Path
+    options: ImportOptions
+    parts: Parts
+    first: TimedRecording
+    reading: Reading
+    executor: LocalExecutor
+    progress: bool
+
+    def run(self, shard_episodes: int) -> DatasetCard:
+        """Look, decode, and fill the folder."""
+        scans = [] if self.recorded.costly else self._looked_at()
+        fps = self._rate(scans)
+        bad = {(each.split, each.index): [*each.defects] for each in scans if each.defects}
+        for each in scans:
+            bad.setdefault((each.split, each.index), []).extend(self._of_another_rate(each, fps))
+        plan = self._plan(scans, fps)
+        staging = self.out / STAGING
+        if not staging.exists() and (self.out / CARD).exists():
+            return self._made_before(plan)
+        with writing(self.out):
+            if self.out.exists():
+                _refuse_other_files(self.out)
+            staging.mkdir(parents=True, exist_ok=True)
+        with held(staging, self.out):
+            staged = self._decoded(fps, {place for place, defects in bad.items() if defects})
+            kept, skipped = self._sound(bad, staged)
+            scans = [each.scan for each in kept]
+            card = self._card(fps, plan, shard_episodes, scans, skipped)
+            made = self._filled(card, kept)
+        shutil.rmtree(staging, ignore_errors=True)
+        return made
+
+    def _looked_at(self) -> list[Scan]:
+        total = sum(len(places) for _, places in self.parts.values())
+        tasks = [
+            ScanTask(
+                _picked(recordings, places[start : start + AT_ONCE]),
+                split,
+                tuple(places[start : start + AT_ONCE]),
+                self.reading,
+                max(64, ROWS // total),
+            )
+            for split, (recordings, places) in self.parts.items()
+            for start in range(0, len(places), AT_ONCE)
+        ]
+        executor = self.executor if total > AT_ONCE else LocalExecutor(0)  # workers start slowly
+        shown = self.progress and total > AT_ONCE
+        with progress_bar("looking", total, shown=shown) as report:
+            found = [each for some in executor.run(scan, tasks, report) for each in some]
+        return sorted(found, key=lambda each: (SPLITS.index(each.split), each.index))
+
+    def _rate(self, scans: Sequence[Scan]) -> float:
+        """Frames per second of the dataset."""
+        if (asked := self.options.alignment.fps) is not None:
+            return plain_rate(asked)
+        measured = [(each.rate, each.seconds) for each in scans]
+        stated = stated_rates(self.recorded, self.first)
+        rate = common_rate(measured, stated) or next(iter(stated), None)
+        if rate is None:
+            raise DataError("the recordings do not tell their rate: give --fps")
+        return plain_rate(rate)
+
+    def _of_another_rate(self, each: Scan, fps: float) -> list[Defect]:
+        if self.options.alignment.fps is not None or not each.rate:
+            return []
+        off = abs(each.rate / fps - 1)
+        if off <= SAME + QUARTER / max(1.0, each.seconds * each.rate):
+            return []
+        rates = f"{each.rate:.4g} frames/s, and the others {fps:.4g}"
+        return [Defect(each.name, f"it has {rates}", "--fps")]
+
+    def _plan(self, scans: Sequence[Scan], fps: float) -> str:
+        """What identifies the dataset to be, but for the pixels of its files."""
+        about = [self.recorded.facts, repr(self.options), fps, [each.keys for each in scans]]
+        return hashlib.sha256(json.dumps(about, default=repr).encode()).hexdigest()
+
+    def _made_before(self, plan: str) -> DatasetCard:
+        """The card of a folder that is whole, if it is what this import would make."""
+        there = DatasetCard.read(self.out)
+        if there.source.get("plan") == plan and set(there.checksums) == set(there.splits):
+            return there
+        now = replace(there, source={**there.source, **self.recorded.facts, "plan": plan})
+        raise other_dataset(self.out, there.differences(now))
+
+    def _decoded(self, fps: float, bad: set[tuple[str, int]]) -> list[Staged]:
+        versions = package_versions()
+        tasks = [
+            StageTask(
+                _picked(recordings, [index]),
+                split,
+                index,
+                self.reading,
+                fps,
+                versions,
+                (self.out / STAGING).absolute(),
+                ROWS // len(places) + 1,
+            )
+            for split, (recordings, places) in self.parts.items()
+            for index in places
+            if (split, index) not in bad or self.options.alignment.on_defect == "trim"
+        ]
+        with progress_bar(self.recorded.name, len(tasks), shown=self.progress) as report:
+            found = list(self.executor.run(stage, tasks, report))
+        order = {(task.split, task.index): place for place, task in enumerate(tasks)}
+        return sorted(found, key=lambda each: order[each.scan.split, each.scan.index])
+
+    def _sound(
+        self, bad: Mapping[tuple[str, int], list[Defect]], staged: Sequence[Staged]
+    ) -> tuple[list[Staged], list[str]]:
+        """The recordings to keep, and why the others are left out.
+
+        Raises:
+            DataError: some have defects and are not to be left out, or all have.
+        """
+        defects = {place: list(each) for place, each in bad.items()}
+        for each in staged:
+            found = defects.setdefault((each.scan.split, each.scan.index), [])
+            found += [defect for defect in each.scan.defects if defect not in found]
+        told = [str(defect) for some in defects.values() for defect in some]
+        decision = self.options.alignment.on_defect
+        if decision == "trim":
+            kept = [each for each in staged if each.files]
+        else:
+            kept = [each for each in staged if not defects[each.scan.split, each.scan.index]]
+        if told and (decision == "refuse" or not kept):
+            count = sum(len(places) for _, places in self.parts.values())
+            wrong = sum(1 for some in defects.values() if some)
+            choice = "; --on-defect skip imports the others" if kept else ""
+            listed = "\n".join(f"  {line}" for line in _few(told))
+            raise DataError(f"{wrong} of {count} recordings have defects{choice}\n{listed}")
+        places = {(each.scan.split, each.scan.index) for each in kept}
+        return kept, [
+            str(d) for place, some in defects.items() if place not in places for d in some
+        ]
+
+    def _card(
+        self,
+        fps: float,
+        plan: str,
+        shard_episodes: int,
+        kept: Sequence[Scan],
+        skipped: Sequence[str] = (),
+    ) -> DatasetCard:
+        """The card of the dataset that holds the recordings `kept`."""
+        rows = {split: _rows([k for k in kept if k.split == split]) for split in self.parts}
+        basis = rows.get("train", np.zeros((0, 0), np.float32))
+        action = self._action(basis if len(basis) else np.concatenate([*rows.values()]))
+        counts: dict[Split, int] = {
+            s: sum(len(k.lengths) for k in kept if k.split == s) for s in SPLITS
+        }
+        size = self.reading.size
+        environment = recorded_card(
+            self.options.environment or self.recorded.name,
+            action,
+            frame_size=(size[0], size[1] * len(self.reading.cameras)),
+            fps=fps,
+            horizon=max(length for each in kept for length in each.lengths),
+            state=self.reading.state,
+            summary=self.recorded.summary,
+            engine=self.recorded.engine,
+            citation=self.recorded.citation,
+            views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
+        )
+        source = {**self.recorded.facts, "plan": plan, "notes": self._notes(kept, rows, action)}
+        if self.recorded.options is not None:
+            kind, name = (str(self.recorded.facts[key]) for key in ("kind", "name"))
+            own = {**self.recorded.options, **self._words()}
+            source["command"] = import_command(kind, name, **own)
+        if skipped:
+            source["skipped"] = list(_few(skipped))
+        return DatasetCard(
+            environment=environment,
+            splits={split: count for split, count in counts.items() if count},
+            seed=self.recorded.seed,
+            options={"size": list(environment.frame_size)},
+            factors={},
+            shard_episodes=shard_episodes,
+            versions=package_versions(),
+            source=source,
+        )
+
+    def _action(self, rows: NDArray[np.float32]) -> ActionSpec:
+        """What the actions are, with bounds of `rows` if none are stated."""
+        action, kinds = self.reading.action, self.options.alignment.kinds
+        action = replace(action, kind=max(kinds, key=kinds.count))
+        if self.reading.stated:
+            return action
+        low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
+        if self.recorded.actions.bounds is not None:
+            low, high = np.minimum(low, action.low), np.maximum(high, action.high)
+        return replace(action, low=tuple(low.tolist()), high=tuple(high.tolist()))
+
+    def _notes(
+        self, kept: Sequence[Scan], rows: Mapping[str, NDArray[np.float32]], action: ActionSpec
+    ) -> list[str]:
+        """What people should know about the dataset."""
+        notes, alignment = [*self.recorded.notes], self.options.alignment
+        if self.recorded.actions.bounds is None:
+            quantile = self.options.bounds == "quantile"
+            which = "the range but for a hundredth at either end" if quantile else "the range"
+            notes.append(f"The bounds of actions are {which} of the training episodes.")
+            if not quantile and "train" in rows:
+                notes += outliers(rows["train"], action.names)
+        for split, some in rows.items():
+            notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
+        if alignment.shift:
+            notes.append(f"Actions were moved by {alignment.shift} frames.")
+        told = [f"{each.name}: {note}" for each in kept for note in each.notes]
+        told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
+        others = [name for name in self.first.cameras if name not in self.reading.cameras]
+        if others:
+            notes.append(f"Frames of {self.reading.cameras[0]}; other cameras: {', '.join(others)}")
+        return [*notes, *_few(told)]
+
+    def _words(self) -> dict[str, object]:
+        """The options of the command that imports the same again."""
+        asked, alignment, usual = self.options, self.options.alignment, Alignment()
+        several = len(self.first.cameras) > 1
+        height, width = self.reading.size
+        words: dict[str, object] = {
+            "camera": list(self.reading.cameras) if several else None,
+            "size": f"{height}x{width}",
+            "environment": asked.environment,
+            "test_episodes": asked.test_episodes,
+            "bounds": None if asked.bounds == "range" else asked.bounds,
+            "depth_range": asked.depth_range
+            and ",".join(f"{each:g}" for each in asked.depth_range),
+        }
+        kinds = ",".join(alignment.kinds)
+        words["action_kind"] = None if kinds == self.recorded.actions.kind else kinds
+        names = ("fps", "tolerance", "max_gap", "shift", "on_defect")
+        changed = {name: getattr(alignment, name) for name in names}
+        return words | {n: v for n, v in changed.items() if v != getattr(usual, n)}
+
+    def _filled(self, card: DatasetCard, kept: Sequence[Staged]) -> DatasetCard:
+        """Fill the shards with the staged episodes."""
+        staging = self.out / STAGING
+        files = {s: [f for k in kept if k.scan.split == s for f in k.files] for s in card.splits}
+        with writing(self.out):
+            with written_whole(staging / ORDER) as partial:
+                partial.write_text(json.dumps(files), encoding="utf-8")
+            if (self.out / CARD).exists() and DatasetCard.read(self.out).differences(card):
+                (self.out / CARD).unlink()  # a killed import left it, with other options or files
+                for split in SPLITS:
+                    shutil.rmtree(self.out / split, ignore_errors=True)
+        source = StagedEpisodes(staging.absolute(), card.environment.action, card.versions)
+        return fill(self.out, card, source, LocalExecutor(0), progress=False)
+
+
+def _first(recorded: RecordedDataset, parts: Parts) -> TimedRecording:
+    """The first recording that can be opened."""
+    problem = None
+    for split, (recordings, places) in parts.items():
+        for index in places:
+            try:
+                found = opened(recordings, index, episode_name(split, index), recorded.fps)
+                if any(frames.size for frames in found.cameras.values()) or not found.cameras:
+                    return found
+            except (DataError, OSError) as error:
+                problem = problem or DataError(f"{episode_name(split, index)}: {error}")
+                if recorded.costly:
+                    raise problem from error
+    raise problem or DataError("there are no recordings")
+
+
+def _picked(recordings: Recordings, places: Sequence[int]) -> Recordings:
+    """What is sent to a worker: of a list only the recordings that it needs."""
+    if isinstance(recordings, list | tuple):
+        return cast(Recordings, {index: cast(Any, recordings)[index] for index in places})
+    return recordings
+
+
+def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
+    """Rows of the actions of some recordings ``[N, A]``."""
+    rows = [each.actions for each in kept if len(each.actions)]
+    return np.concatenate(rows) if rows else np.zeros((0, 0), np.float32)
+
+
+def _few(lines: Sequence[str]) -> Sequence[str]:
+    if len(lines) <= MOST_TOLD:
+        return lines
+    return [*lines[:MOST_TOLD], f"and {len(lines) - MOST_TOLD} more"]
+
+
+def _refuse_other_files(out: Path) -> None:
+    names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    if names and not (out / STAGING).exists():
+        raise DataError(
+            f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
+        )
+
+
+def import_command(kind: str, name: str, **options: object) -> str:
+    """The command ``acwm data import KIND NAME --option value …``; options of None are left out."""
+    words = ["acwm", "data", "import", kind, name]
+    for option, value in options.items():
+        for each in value if isinstance(value, list) else [value]:  # pyright: ignore
+            if each is not None:
+                size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else each
+                words += [f"--{option.replace('_', '-')}", str(size)]
+    return shlex.join(words)

@@ -6,7 +6,7 @@ import functools
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,12 +17,11 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, StateField
+from acwm_core.env.card import plain_rate
 from acwm_core.env.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
-from acwm_formats.format import Format, import_command
-from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
-from acwm_formats.video import shrunk, target_size
+from acwm_formats.format import Format
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Recording
 
 RANDOM = "random"
 OBSERVATION = "observation"
@@ -43,8 +42,6 @@ class Gymnasium(Format):
         policy: str = RANDOM,
         seed: int = 0,
         frames: int = 1000,
-        size: int | tuple[int, int] | None = None,
-        environment: str | None = None,
     ) -> RecordedDataset:
         """Import rollouts of the Gymnasium environment ENV_ID, simulated during the import.
 
@@ -59,11 +56,10 @@ class Gymnasium(Format):
             policy: Who acts: random, or module:function of an observation and a random generator.
             seed: Seed of the dataset: of every episode's start and policy.
             frames: End episodes after this many frames.
-            size: Frame size, 64 or HEIGHTxWIDTH; by default that of the rendered frames.
-            environment: Name of the environment.
         """
-        counts, name = _counts(episodes, frames), _name(env_id, environment)
+        counts, name = _counts(episodes, frames), _name(env_id)
         env = _environment(env_id)
+        _policy(policy, env)  # which must be there
         made: dict[Split, Rollouts] = {
             split: Rollouts(env_id, policy, EpisodeSpec(name, split, seed=seed), frames, count)
             for split, count in counts.items()
@@ -71,27 +67,24 @@ class Gymnasium(Format):
         }
         if not made:
             raise RecipeError("there are no episodes to make: every split has 0")
-        card = _card(env, next(iter(made.values())), size)
         fps = env.metadata.get("render_fps")
-        options: dict[str, Any] = {
-            "episodes": ",".join(map(str, counts.values())),
-            "policy": policy,
-            "seed": seed,
-            "frames": frames,
-            "environment": environment,
-            "size": card.frame_size,
-        }
         return RecordedDataset(
-            card,
-            {split: replace(rollouts, size=card.frame_size) for split, rollouts in made.items()},
-            facts={
-                "kind": "gymnasium",
-                "name": env_id,
-                "command": import_command("gymnasium", env_id, **options),
-                "version": version("gymnasium"),
+            name,
+            made,
+            {"kind": "gymnasium", "name": env_id, "version": version("gymnasium")},
+            fps=plain_rate(fps or FPS),
+            options={
+                "episodes": ",".join(map(str, counts.values())),
+                "policy": policy,
+                "seed": seed,
+                "frames": frames,
             },
+            actions=_action(env_id, env.action_space),
             notes=() if fps else (f"The environment has no render_fps; {FPS} are assumed.",),
             seed=seed,
+            costly=True,
+            summary=f"{env_id} under the policy {policy}",
+            engine="Gymnasium",
         )
 
     @classmethod
@@ -111,45 +104,20 @@ def _counts(episodes: tuple[int, ...], frames: int) -> dict[Split, int]:
     return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 
 
-def _name(env_id: str, given: str | None) -> str:
+def _name(env_id: str) -> str:
     name = re.sub(r"-v\d+$", "", env_id.rpartition("/")[2].rpartition(":")[2])
-    return re.sub(r"\W+", "_", given or name).strip("_").lower()
-
-
-def _card(
-    env: gymnasium.Env[Any, Any], rollouts: Rollouts, size: int | tuple[int, int] | None
-) -> EnvironmentCard:
-    """What an environment shows: an episode is played to find out size, length and states."""
-    action = _action(rollouts.env_id, env.action_space)
-    limit, probe = env.spec.max_episode_steps if env.spec else None, rollouts[0]
-    return recorded_card(
-        rollouts.spec.environment,
-        action,
-        frame_size=target_size((probe.video.shape[1], probe.video.shape[2]), size),
-        fps=round(env.metadata.get("render_fps") or FPS),
-        horizon=min(rollouts.frames, limit + 1) if limit else probe.frames,
-        state=[
-            StateField(name, rows.shape[1:], "", "as observed")
-            for name, rows in probe.states.items()
-        ],
-        summary=f"{rollouts.env_id} under the policy {rollouts.policy}",
-        engine="Gymnasium",
-    )
+    return re.sub(r"\W+", "_", name).strip("_").lower()
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """The rollouts of one split; `spec` is the one of episode 0.
-
-    Frames are averaged down to `size`, if it is given.
-    """
+    """The rollouts of one split; `spec` is the one of episode 0."""
 
     env_id: str
     policy: str
     spec: EpisodeSpec
     frames: int
     count: int
-    size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         """The number of rollouts."""
@@ -163,20 +131,22 @@ class Rollouts:
         env.action_space.seed(int(rng.integers(2**31)))
         act = _policy(self.policy, env)
         observation, _ = env.reset(seed=int(spec.rng("reset").integers(2**31)))
-        images, seen, taken = [_frame(env)], [observation], cast(list[NDArray[Any]], [])
+        images, taken = [_frame(env)], list[NDArray[np.float32]]()
+        seen = [np.array(observation)]  # copies: an environment may reuse its arrays
         ended = False
         while not ended and len(images) < self.frames:
             action = act(observation, rng)
-            observation, _, terminated, truncated, _ = env.step(action)
             taken.append(_vector(env.action_space, action))
+            observation, _, terminated, truncated, _ = env.step(action)
             images.append(_frame(env))
-            seen.append(observation)
+            seen.append(np.array(observation))
             ended = terminated or truncated
         space: Any = env.observation_space
         vectors = isinstance(space, Box) and len(space.shape) == 1
+        if len({image.shape for image in images}) > 1:
+            raise DataError("its render() returns frames of several sizes")
         states = {OBSERVATION: np.stack(seen)} if vectors else {}
-        video = shrunk(images, self.size) if self.size else np.stack(images)
-        return Recording(video, np.stack(taken), states)
+        return Recording(np.stack(images), np.stack(taken), states)
 
 
 @functools.lru_cache(maxsize=1)
@@ -217,11 +187,11 @@ def _policy(name: str, env: gymnasium.Env[Any, Any]) -> Policy:
     return found
 
 
-def _action(env_id: str, space: gymnasium.Space[Any]) -> ActionSpec:
+def _action(env_id: str, space: gymnasium.Space[Any]) -> ActionFacts:
     if isinstance(space, Discrete):
         count = int(space.n)
         names = tuple(f"action_{i + int(space.start)}" for i in range(count))
-        return ActionSpec(names, ("",) * count, (0.0,) * count, (1.0,) * count, "absolute")
+        return ActionFacts(names, bounds=((0.0,) * count, (1.0,) * count))
     if not isinstance(space, Box):
         raise DataError(
             f"{env_id} has actions of the kind {type(space).__name__}: Box and Discrete can be "
@@ -234,20 +204,18 @@ def _action(env_id: str, space: gymnasium.Space[Any]) -> ActionSpec:
             f"{env_id} has actions without finite bounds, by which models normalise: wrap it in an "
             "environment whose Box has the bounds that are used, and import that"
         )
-    names = tuple(f"action_{i}" for i in range(len(low)))
-    units = ("",) * len(low)
-    return ActionSpec(names, units, tuple(low.tolist()), tuple(high.tolist()), "absolute")
+    return ActionFacts(bounds=(tuple(low.tolist()), tuple(high.tolist())))
 
 
 def _vector(space: gymnasium.Space[Any], action: Any) -> NDArray[np.float32]:
     if isinstance(space, Discrete):
         return np.eye(int(space.n), dtype=np.float32)[int(action) - int(space.start)]
-    return np.asarray(action, np.float32).reshape(-1)
+    return np.array(action, np.float32).reshape(-1)
 
 
 def _frame(env: gymnasium.Env[Any, Any]) -> NDArray[np.uint8]:
     try:
-        frame = np.asarray(env.render())
+        frame = np.array(env.render())
     except Exception as error:  # e.g. OpenGL or a drawing library is missing
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"the environment cannot be rendered ({reason})") from error

@@ -7,6 +7,7 @@ and states are brought together is decided in one place, `acwm_formats.alignment
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from acwm_core.env.card import ActionKind, StateField
 from acwm_core.env.episode import Split
+from acwm_core.errors import DataError
+from acwm_formats.frames import ImageFrames
 
 
 class Frames(Protocol):
@@ -102,6 +105,49 @@ class TimedRecording:
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
+@dataclass(frozen=True)
+class Recording:
+    """One recorded episode as arrays.
+
+    Attributes:
+        video: ``[T, H, W, 3]`` uint8; other images are converted as `acwm_formats.images` says.
+        actions: ``[T, A]`` or ``[T − 1, A]``; row i leads from frame i to frame i + 1, so a T-th
+            row leads to no frame and is dropped.
+        states: arrays of numbers by name, each ``[T, …]``.
+        times: ``[T]`` when each frame was taken, in seconds; by default at the dataset's rate.
+        action_times: when each action was taken, on the same clock. Then there may be any number of
+            actions.
+    """
+
+    video: NDArray[Any]
+    actions: NDArray[Any]
+    states: Mapping[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    times: NDArray[np.floating[Any]] | None = None
+    action_times: NDArray[np.floating[Any]] | None = None
+
+    def timed(self, name: str, fps: float | None) -> TimedRecording:
+        """The same as a `TimedRecording`, with frames at a constant rate if it has no times.
+
+        Raises:
+            DataError: it has neither times nor a rate, or as many times as frames are not there.
+        """
+        video = np.asarray(self.video)
+        if video.ndim < 3:
+            raise DataError(f"video is {video.dtype} {video.shape}, not uint8 [T, H, W, 3]")
+        if self.times is None:
+            times = np.arange(len(video)) / (fps or 1.0)
+        else:
+            times = np.asarray(self.times, np.float64)
+        if len(times) != len(video):
+            raise DataError(f"it has {len(video)} frames and {len(times)} times")
+        taken = None if self.action_times is None else np.asarray(self.action_times, np.float64)
+        states = {name: Samples(np.asarray(rows)) for name, rows in self.states.items()}
+        stamp = hashlib.sha256(np.ascontiguousarray(video).data).hexdigest()
+        frames = ImageFrames(video, times, stamp=stamp)
+        actions = Samples(np.asarray(self.actions), taken)
+        return TimedRecording(name, {"video": frames}, actions, states)
+
+
 class Recordings(Protocol):
     """Recordings by index, from 0: a list, or an object that opens them on request.
 
@@ -113,8 +159,8 @@ class Recordings(Protocol):
         """Number of recordings."""
         ...
 
-    def __getitem__(self, index: int, /) -> TimedRecording:
-        """Open one recording, without decoding its frames."""
+    def __getitem__(self, index: int, /) -> TimedRecording | Recording:
+        """Open one recording; a `TimedRecording` without decoding its frames."""
         ...
 
 
@@ -126,14 +172,15 @@ class ActionFacts:
         names: one per dimension; ``action_0``, … if it is empty.
         units: one per dimension; none if it is empty.
         kind: what an action commands.
-        bounds: lower and upper bounds that are stated; an action beyond them is a defect. None:
-            those of the training episodes.
+        bounds: lower and upper bounds that are stated. None: those of the training episodes.
+        widened: the training episodes widen the bounds; else an action beyond them is a defect.
     """
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     kind: ActionKind = "absolute"
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    widened: bool = False
 
 
 @dataclass(frozen=True)
@@ -144,15 +191,18 @@ class RecordedDataset:
         name: the environment that they show, one word.
         splits: the recordings of each split; or all of them, if the source does not divide them, so
             that the last become test episodes.
+        tests: which of recordings that are not divided are test episodes, if the source says so.
         facts: `kind` (the format) and `name` of what is imported, and what identifies it.
+        fps: frames per second that the source states for all recordings.
         options: the format's own options, for the command that imports it again; None if no command
             does.
         actions: what is known of the actions.
         state: the states to keep; None keeps all that the first recording has.
+        size: frame size of a camera by default, as in `ImportOptions`.
         notes: sentences for people, kept in the card.
         seed: seed of the dataset, if the recordings were made with one.
-        simulated: recordings are made when they are opened, which is costly. So they are opened
-            once, and their rate and the bounds of actions must be stated.
+        costly: opening a recording is as much work as reading it, e.g. because it is simulated. So
+            each is opened once, and `fps` and the bounds of `actions` must be given.
         summary: one sentence about the data.
         engine: what made it.
         citation: its source.
@@ -161,12 +211,15 @@ class RecordedDataset:
     name: str
     splits: Mapping[Split, Recordings] | Recordings
     facts: Mapping[str, Any]
+    fps: float | None = None
+    tests: Mapping[Split, Sequence[int]] | None = None
     options: Mapping[str, object] | None = None
     actions: ActionFacts = ActionFacts()
     state: tuple[StateField, ...] | None = None
+    size: int | tuple[int, int] | None = None
     notes: tuple[str, ...] = ()
     seed: int = 0
-    simulated: bool = False
+    costly: bool = False
     summary: str = ""
     engine: str = "recorded"
     citation: str = ""

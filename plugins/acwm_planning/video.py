@@ -77,7 +77,7 @@ class EpisodeCurves:
     failed: bool
     unit: str
     tolerance: float
-    fps: int
+    fps: float
     panels: list[str]
     distances: list[float | None]
     imagined: list[float | None]
@@ -105,7 +105,7 @@ def draw_curves(
     seed: int,
     result: EpisodeResult,
     task: Task,
-    fps: int,
+    fps: float,
     imagined: Imagined | None = None,
     estimator: StateEstimator | None = None,
     stride: int = 1,

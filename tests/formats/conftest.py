@@ -8,7 +8,9 @@ import pytest
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
+from acwm_formats.alignment import Alignment
 from acwm_formats.published import Published
+from acwm_formats.reading import ImportOptions
 from acwm_formats.recordings import import_dataset
 from tests.folders import checksums as checksums
 from tests.formats import release
@@ -47,7 +49,13 @@ def folder(published, tmp_path):
 
 
 def load_published(folder, out, workers=0, shard_episodes=2, **options):
-    recorded = Published().read(folder, **options)
+    return imported(Published().read(folder), out, workers, shard_episodes, **options)
+
+
+def imported(recorded, out, workers=0, shard_episodes=2, **options):
+    """Import with options, of which those of the alignment need no other name."""
+    how = {name: options.pop(name) for name in ("on_defect", "fps", "shift") if name in options}
+    asked = ImportOptions(alignment=Alignment(**how), **options)
     return import_dataset(
-        recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
+        recorded, out, asked, workers=workers, shard_episodes=shard_episodes, progress=False
     )

@@ -24,7 +24,7 @@ from acwm_formats.hdf5 import HDF5
 from acwm_formats.lerobot import LeRobot
 from acwm_formats.published import Published
 from acwm_formats.recordings import import_dataset
-from tests.formats.conftest import episodes_of, psnr
+from tests.formats.conftest import episodes_of, imported, psnr
 
 ROOT = Path(__file__).parents[2]
 CAMERA = "observation.images.main"
@@ -192,8 +192,7 @@ def test_many_files_hold_what_one_does(lerobot, simulated, tmp_path, monkeypatch
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("data/*/*"))] == names
     assert [f"{p.parent.name}/{p.stem}" for p in sorted(root.glob("videos/*/*/*"))] == names
     for folder, place in (("one", lerobot), ("many_back", root)):
-        recorded = LeRobot().read(place, environment="same")
-        import_dataset(recorded, tmp_path / folder, workers=0, progress=False)
+        imported(LeRobot().read(place), tmp_path / folder, environment="same", shard_episodes=32)
     both = episodes_of(tmp_path / "one"), episodes_of(tmp_path / "many_back")
     for a, b in zip(*both, strict=True):
         np.testing.assert_array_equal(a.actions, b.actions)

@@ -12,19 +12,18 @@ import pytest
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.check import check_dataset
-from acwm_formats.recordings import import_dataset
 from acwm_formats.rollouts import Gymnasium
 from tests.formats import toy_envs
+from tests.formats.conftest import imported
 
 DOT = "tests.formats.toy_envs:Toy/Dot-v0"
 COUNTS = (3, 2)
 
 
 def load(env_id, out, workers=0, shard_episodes=2, **options):
+    asked = {name: options.pop(name) for name in ("size", "environment") if name in options}
     recorded = Gymnasium().read(env_id, **{"episodes": COUNTS, "frames": 12} | options)
-    return import_dataset(
-        recorded, out, workers=workers, shard_episodes=shard_episodes, progress=False
-    )
+    return imported(recorded, out, workers, shard_episodes, **asked)
 
 
 def test_rollouts_can_be_played_again_by_their_actions(tmp_path):
@@ -108,7 +107,9 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
     ):
         with pytest.raises(RecipeError, match=problem):
             load(DOT, tmp_path / "data", policy=policy)
-    with pytest.raises(DataError, match="episode 0 of train: an action is out of bounds"):
+    with pytest.raises(
+        DataError, match=r"episode 0 of train: the action action_1 is 9 in row 0, .* \[-1, 1\]"
+    ):
         load(DOT, tmp_path / "data", policy="tests.formats.toy_envs:too_far")
     with pytest.raises(RecipeError, match="no episodes to make"):
         load(DOT, tmp_path / "data", episodes=(0, 0))

@@ -13,17 +13,21 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats.check import check_dataset
 from acwm_formats.lerobot import LeRobot
-from acwm_formats.recordings import import_dataset
+from acwm_formats.reading import ImportOptions, common_reading, divided
 from tests.formats import release
-from tests.formats.conftest import episodes_of, psnr
+from tests.formats.conftest import episodes_of, imported, psnr
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "lerobot"
 LENGTHS = (9, 7, 8, 6)
 
 
-def load(root, out, workers=0, **options):
-    recorded = LeRobot().read(root, **options)
-    return import_dataset(recorded, out, workers=workers, shard_episodes=2, progress=False)
+def load(root, out, **options):
+    return imported(LeRobot().read(root), out, **options)
+
+
+def lengths(folder):
+    """Number of frames of all episodes of a data folder."""
+    return [len(episode.video) for episode in episodes_of(folder)]
 
 
 def reference_video(episode):
@@ -56,13 +60,13 @@ def change_places(root, **columns):
 
 @pytest.mark.parametrize("kind", ["video", "image"])
 def test_what_the_library_wrote_comes_in(kind, tmp_path):
-    card = load(REFERENCE / kind, tmp_path / "data")
-    assert card.splits == {"train": 2, "ind_test": 2}
+    card = load(REFERENCE / kind, tmp_path / "data", test_episodes=0)
+    assert card.splits == {"train": 4}
     assert (card.environment.fps, card.environment.frame_size) == (10, (48, 64))
     assert card.environment.action.names == ("shoulder", "elbow")
     assert (card.environment.action.low, card.environment.action.high) == (
         (0.25, -3.5),
-        (3.25, 4.5),
+        (3.25, 3.5),  # the last row of an episode leads to no frame
     )
     assert "toy arm" in card.environment.summary
     for number, episode in enumerate(episodes_of(tmp_path / "data")):
@@ -77,17 +81,20 @@ def test_what_the_library_wrote_comes_in(kind, tmp_path):
     assert [f for f in check_dataset(tmp_path / "data") if f.problem] == []
 
 
+def parts(root, test_episodes=None):
+    """The numbers of the episodes of each split."""
+    found = divided(LeRobot().read(root), test_episodes)
+    return {split: list(numbers) for split, (_, numbers) in found.items()}
+
+
 def test_splits_are_the_datasets_own_or_the_last_episodes(root):
-    assert {s: len(r) for s, r in LeRobot().read(root, test_episodes=1).splits.items()} == {
-        "train": 3,
-        "ind_test": 1,
-    }
-    assert set(LeRobot().read(root, test_episodes=0).splits) == {"train"}
+    assert parts(root) == {"train": [0, 1], "ind_test": [2, 3]}
+    assert parts(root, 1) == {"train": [0, 1, 2], "ind_test": [3]}
+    assert parts(root, 0) == {"train": [0, 1, 2, 3]}
     with pytest.raises(DataError, match="4 of 4 episodes cannot be set aside"):
-        LeRobot().read(root, test_episodes=4)
+        parts(root, 4)
     change_info(root, splits={"train": "0:1", "test": "1:3", "val": "3:4"})
-    splits = LeRobot().read(root).splits
-    assert {s: list(r.episodes) for s, r in splits.items()} == {"train": [0, 3], "ind_test": [1, 2]}
+    assert parts(root) == {"train": [0, 3], "ind_test": [1, 2]}
 
 
 def test_frames_shrink_and_the_name_can_be_given(root, tmp_path):
@@ -97,15 +104,19 @@ def test_frames_shrink_and_the_name_can_be_given(root, tmp_path):
     assert psnr(EpisodeDataset(tmp_path / "data", "train")[0].video, truth) > 27
 
 
-def test_a_video_that_ends_early_shortens_its_episode(root, tmp_path):
+def test_a_video_that_ends_early_is_told_with_both_numbers(root, tmp_path):
     shortened = np.concatenate([reference_video(e) for e in range(4)])[:-2]
     release.video(root / "videos/observation.images.top/chunk-000/file-000.mp4", shortened)
-    card = load(root, tmp_path / "data")
-    assert EpisodeDataset(tmp_path / "data", "ind_test").lengths == [8, 4]
-    assert "ind_test: 1 of 2 are shorter than they are said to be" in card.source["notes"]
+    with pytest.raises(DataError, match=r"episode 3: it is said to have 6 frames, and has 4"):
+        load(root, tmp_path / "data")
+    card = load(root, tmp_path / "skipped", on_defect="skip")
+    assert lengths(tmp_path / "skipped") == [9, 7, 8]
+    assert "6 frames, and has 4" in card.source["skipped"][0]
+    load(root, tmp_path / "trimmed", on_defect="trim")
+    assert lengths(tmp_path / "trimmed") == [9, 7, 8, 4]
 
 
-def test_names_in_any_form_and_dimensions_that_never_move(root):
+def test_names_in_any_form(root):
     info = json.loads((root / "meta/info.json").read_text())
     action = info["features"]["action"]
     for names, found in (
@@ -117,14 +128,9 @@ def test_names_in_any_form_and_dimensions_that_never_move(root):
     ):
         action["names"] = names
         change_info(root, features=info["features"])
-        assert LeRobot().read(root).environment.action.names == found
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    still = pa.array([[1.0, 0.5]] * len(table), pa.list_(pa.float32()))
-    place = table.schema.get_field_index("action")
-    pq.write_table(table.set_column(place, "action", still), path)
-    spec = LeRobot().read(root).environment.action
-    assert (spec.low, spec.high) == ((0.0, -0.5), (2.0, 1.5))
+        read = LeRobot().read(root)
+        first = read.splits[0]
+        assert common_reading(read, first, ImportOptions()).action.names == found
 
 
 def version_2(root, lengths=(9, 7, 8)):
@@ -165,7 +171,7 @@ def version_2(root, lengths=(9, 7, 8)):
 
 def test_version_2_comes_in_too(tmp_path):
     version_2(tmp_path / "old")
-    load(tmp_path / "old", tmp_path / "data", test_episodes=1)
+    load(tmp_path / "old", tmp_path / "data", test_episodes=0)
     for number, episode in enumerate(episodes_of(tmp_path / "data")):
         assert psnr(episode.video, reference_video(number)) > 30
         assert episode.actions[2].tolist() == [number + 0.25, -1.5]
@@ -197,41 +203,38 @@ def spoil(path):
         (lambda r: (r / "meta/acwm.json").write_text('{"name": 3}'), "is not a card"),
     ],
 )
-def test_what_misleads_is_refused(root, change, problem):
+def test_what_misleads_is_refused(root, change, problem, tmp_path):
     change(root)
     with pytest.raises(DataError, match=problem):
-        LeRobot().read(root)
+        load(root, tmp_path / "data")
 
 
 def test_a_damaged_video_and_a_wrong_camera_are_named(root, tmp_path):
     with pytest.raises(DataError, match=r"did you mean 'observation\.images\.top'"):
-        LeRobot().read(root, camera="observation.images.to")
+        load(root, tmp_path / "data", cameras=("observation.images.to",))
     with pytest.raises(DataError, match="cannot be enlarged"):
-        LeRobot().read(root, size=128)
+        load(root, tmp_path / "data", size=128)
     video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
-    content = bytearray(video.read_bytes())
-    recorded = LeRobot().read(root)
+    content = video.read_bytes()
     video.write_bytes(b"text")
-    with pytest.raises(DataError, match=r"episode 0 of train: the video .*file-000\.mp4 cannot"):
-        import_dataset(recorded, tmp_path / "data", workers=0, progress=False)
+    with pytest.raises(DataError, match=r"file-000\.mp4 is no MP4"):
+        load(root, tmp_path / "data")
     video.write_bytes(content)
-    assert (
-        import_dataset(recorded, tmp_path / "data", workers=0, progress=False).splits["train"] == 2
-    )
+    assert load(root, tmp_path / "data").splits["train"] == 2
 
 
-def test_actions_that_are_none_are_refused(root):
+def test_actions_that_are_none_are_refused(root, tmp_path):
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     place = table.schema.get_field_index("action")
     for values, problem in (
         (pa.array(["left"] * len(table)), "not numbers"),
-        (pa.array([[float("nan")]] * len(table)), "not finite"),
+        (pa.array([[float("nan")] * 2] * len(table)), "not finite"),
         (pa.array([[1.0] * (1 + i % 2) for i in range(len(table))]), "different shapes"),
     ):
         pq.write_table(table.set_column(place, "action", values), path)
         with pytest.raises(DataError, match=problem):
-            LeRobot().read(root)
+            load(root, tmp_path / "data")
     pq.write_table(table.drop_columns(["action"]), path)
     with pytest.raises(DataError, match="cannot be read"):
-        LeRobot().read(root)
+        load(root, tmp_path / "data")

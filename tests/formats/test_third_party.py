@@ -3,6 +3,7 @@
 import importlib
 import re
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,15 +13,14 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
-from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError, PluginError
 from acwm_core.plugins import catalog, hookimpl
 from acwm_formats.checks import check_format
-from acwm_formats.format import Format, import_command
-from acwm_formats.recordings import RecordedDataset, Recording, recorded_card
+from acwm_formats.format import Format
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Recording
 from tests.checks.results import failures, installed
 
-ACTION = ActionSpec(("x",), ("",), (-1.0,), (1.0,), "delta")
+ACTION = ActionFacts(("x",), kind="delta", bounds=((-1.0,), (1.0,)))
 
 
 class Folder(Format):
@@ -52,12 +52,16 @@ class Folder(Format):
         if not files:
             raise DataError(f"{root} has no .npz file")
         recordings = [_read(file, mirror) for i, file in enumerate(files) if i not in skip]
-        card = recorded_card(
-            "mine", ACTION, frame_size=(16, 16), fps=round(rate), horizon=4, summary="Mine."
-        )
         facts = {"kind": "npz", "name": Path(root).name}
-        facts["command"] = import_command("npz", facts["name"], rate=rate)
-        return RecordedDataset(card, {"train": recordings}, facts)
+        return RecordedDataset(
+            "mine",
+            {"train": recordings},
+            facts,
+            fps=rate,
+            options={"rate": rate},
+            actions=ACTION,
+            summary="Mine.",
+        )
 
     @classmethod
     def example(cls, folder):
@@ -141,7 +145,7 @@ def test_it_imports_and_exports(third_party, root, tmp_path):
     assert "holds 1 train episodes of mine" in done.output
     card = DatasetCard.read(out)
     assert (card.environment.fps, card.source["kind"]) == (5, "npz")
-    assert card.command("x") == "acwm data import npz mine --rate 5.0 --out x"
+    assert card.command("x") == "acwm data import npz mine --rate 5.0 --size 16x16 --out x"
     assert said("data", "export", "raw", out, "--out", tmp_path / "raw").exit_code == 0
     (file,) = (tmp_path / "raw").iterdir()
     assert file.name == "train_000.npz"
@@ -249,7 +253,7 @@ class NoTraining(Folder):
             root: the folder.
         """
         found = super().read(root)
-        return RecordedDataset(found.environment, {"ind_test": found.splits["train"]}, found.facts)
+        return replace(found, splits={"ind_test": found.splits["train"]})
 
 
 class Everything(Folder):

@@ -1,14 +1,21 @@
 """`write_dataset`: a format of one's own becomes a dataset like any other."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.env.card import exact_rate
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError, ShapeError
+from acwm_formats.alignment import Alignment
 from acwm_formats.arrays import Recording, write_dataset
 from acwm_formats.check import check_dataset
+from acwm_formats.format import export_dataset
+from acwm_formats.lerobot import LeRobot
+from acwm_formats.recordings import import_dataset
 from tests.formats import release
 from tests.formats.conftest import checksums
 
@@ -61,17 +68,32 @@ def test_workers_and_a_second_call_change_nothing(tmp_path):
         write(tmp_path / "0", {"train": Mine(3, seed=1)})
 
 
-def test_arrays_of_any_length_keep_what_all_span(tmp_path):
+def test_arrays_that_do_not_fit_are_refused_unless_it_is_said_how(tmp_path):
     frames, actions = release.moving_square(np.random.default_rng(0), 9, (40, 48))
-    steps = np.arange(9)
-    recordings = [
-        Recording(frames, actions, {"step": steps}),
-        Recording(frames, actions[:4], {"step": steps}),
-        Recording(frames[:6], actions, {"step": steps}),
-        Recording(frames, actions, {"step": steps[:7]}),
-    ]
-    write(tmp_path / "data", {"train": recordings})
-    assert EpisodeDataset(tmp_path / "data", "train").lengths == [9, 5, 6, 7]
+    times, steps = np.arange(9) / 5, {"step": np.arange(9)}
+    dropped = np.delete(frames, 4, axis=0), np.delete(times, 4)
+    lost = Recording(dropped[0], actions, {"step": np.arange(8)})
+    with pytest.raises(DataError, match="action has 9 rows, and the video 8 frames"):
+        write(tmp_path / "lost", {"train": [lost]})
+    told = Recording(dropped[0], actions, steps, dropped[1], times)
+    write(tmp_path / "told", {"train": [told]})
+    episode = EpisodeDataset(tmp_path / "told", "train")[0]
+    np.testing.assert_array_equal(episode.actions[:-1], actions[:-1])
+    np.testing.assert_array_equal(episode.video, frames[[0, 1, 2, 3, 3, 5, 6, 7, 8]])
+    short = [Recording(frames, actions[:4], steps), Recording(frames[:6], actions, steps)]
+    write(tmp_path / "trim", {"train": short}, alignment=Alignment(on_defect="trim"))
+    assert EpisodeDataset(tmp_path / "trim", "train").lengths == [5, 6]
+
+
+@pytest.mark.parametrize("fps", [29.97, Fraction(30000, 1001), 30, 7.5])
+def test_rates_are_kept_exactly(tmp_path, fps):
+    card = write(tmp_path / "data", {"train": Mine(1)}, fps=fps)
+    assert exact_rate(card.environment.fps) == Fraction(str(fps))
+    assert DatasetCard.read(tmp_path / "data") == card
+    assert (type(card.environment.fps) is int) == (fps == 30)
+    export_dataset(tmp_path / "data", tmp_path / "lerobot", LeRobot(), progress=False)
+    again = import_dataset(LeRobot().read(tmp_path / "lerobot"), tmp_path / "again", workers=0)
+    assert again.environment.fps == card.environment.fps
 
 
 def test_frames_can_shrink(tmp_path):
@@ -90,6 +112,7 @@ def test_frames_can_shrink(tmp_path):
         ({"train": Mine(1)}, {"size": 60}, ShapeError, "multiple of 8"),
         ({"train": Mine(1)}, {"size": 64}, DataError, "cannot be enlarged"),
         ({"train": Mine(1, size=(8, 48))}, {}, DataError, "too small"),
+        ({"train": Mine(1)}, {"fps": 0}, ShapeError, "is no rate"),
     ],
 )
 def test_what_cannot_be_written_is_refused(tmp_path, splits, changes, error, problem):
@@ -100,17 +123,17 @@ def test_what_cannot_be_written_is_refused(tmp_path, splits, changes, error, pro
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"video": np.zeros((6, 40, 48, 3), np.float32)}, "video is float32"),
-        ({"video": np.zeros((6, 40, 48), np.uint8)}, "not uint8"),
+        ({"video": np.full((6, 40, 48, 3), 7.5, np.float32)}, "--pixel-range"),
+        ({"video": np.zeros((6, 40), np.uint8)}, "not uint8"),
         ({"video": np.zeros((1, 40, 48, 3), np.uint8)}, "1 usable frames"),
-        ({"video": np.zeros((6, 16, 16, 3), np.uint8)}, "cannot be enlarged"),
-        ({"actions": np.zeros((6, 3))}, r"not \[T, 2\]"),
-        ({"actions": np.full((6, 2), 1.5)}, "out of bounds"),
+        ({"video": np.zeros((6, 16, 16, 3), np.uint8)}, r"16×16, and those of the first 40×48"),
+        ({"actions": np.zeros((6, 3))}, "3 dimensions, not 2"),
+        ({"actions": np.full((6, 2), 1.5)}, r"action up is 1\.5 in row 0, out of its bounds"),
         ({"actions": np.full((6, 2), np.nan)}, "not finite"),
-        ({"states": {}}, "state fields are"),
-        ({"states": {"step": np.zeros((6, 2))}}, "state step is"),
-        ({"states": {"step": np.array(["a"] * 6)}}, "state step is <U1"),
-        ({"states": {"step": np.array([{}] * 6)}}, "state step is object"),
+        ({"states": {}}, "state step is None"),
+        ({"states": {"step": np.zeros((6, 2))}}, r"state step is \(2,\)"),
+        ({"states": {"step": np.array(["a"] * 6)}}, "step holds <U1"),
+        ({"states": {"step": np.array([{}] * 6)}}, "step holds object"),
     ],
 )
 def test_a_recording_that_cannot_be_is_named(tmp_path, change, problem):
