@@ -209,7 +209,8 @@ def _index_of(root: Path, _: str) -> _Index:
 
 
 def _index(root: Path) -> _Index:
-    return _index_of(root, file_stamp(root / INFO))
+    meta = [root / INFO, *(root / "meta").glob("episodes*"), *(root / "meta").glob("episodes/*/*")]
+    return _index_of(root, " ".join(map(file_stamp, meta)))
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def load_published(folder, out, workers=0, shard_episodes=2, **options):
 
 def imported(recorded, out, workers=0, shard_episodes=2, **options):
     """Import with options, of which those of the alignment need no other name."""
-    how = {name: options.pop(name) for name in ("on_defect", "fps", "shift") if name in options}
+    how = {name: options.pop(name) for name in ("on_defect", "fps", "max_gap") if name in options}
     asked = ImportOptions(alignment=Alignment(**how), **options)
     return import_dataset(
         recorded, out, asked, workers=workers, shard_episodes=shard_episodes, progress=False

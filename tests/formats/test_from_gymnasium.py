@@ -79,6 +79,15 @@ def test_a_time_limit_is_the_horizon_and_silence_is_noted(tmp_path):
     assert "has no render_fps" in card.source["notes"][0]
 
 
+def test_arrays_that_are_used_again_are_copied(tmp_path):
+    env_id, policy = "tests.formats.toy_envs:Toy/Reusing-v0", "tests.formats.toy_envs:counting"
+    load(env_id, tmp_path / "data", policy=policy, frames=5)
+    episode = EpisodeDataset(tmp_path / "data", "train")[0]
+    assert episode.video[:, 0, 0, 0].tolist() == [1, 2, 3, 4, 5]
+    assert episode.states["observation"][:, 0].tolist() == [1, 2, 3, 4, 5]
+    assert episode.actions[:, 0].tolist() == [1, 2, 3, 4, 0]
+
+
 def test_our_own_environments_come_in(tmp_path):
     counts = (1, 0)
     card = load("acwm:acwm/push_cube-v0", tmp_path / "data", episodes=counts, frames=3, size=64)

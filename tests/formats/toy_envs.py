@@ -68,3 +68,40 @@ for kind in ("discrete", "endless", "bits"):
     gymnasium.register(f"Toy/{kind.title()}-v0", f"{HERE}:Dot", kwargs={"actions": kind})
 gymnasium.register("Toy/Blind-v0", f"{HERE}:Dot", kwargs={"frames": "none"})
 gymnasium.register("Toy/Broken-v0", f"{HERE}:Dot", kwargs={"frames": "broken"})
+
+
+class Reusing(gymnasium.Env):
+    """Writes observations and frames into the same arrays in every step, and so does `counting`."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
+    action_space = Box(-9, 99, (1,), np.float32)
+    observation_space = Box(0, 99, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self._seen, self._frame = np.zeros(1, np.float32), np.zeros((16, 16, 3), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._seen[:] = 1
+        return self._seen, {}
+
+    def step(self, action):
+        self._seen += 1
+        action[:] = 0
+        return self._seen, 0.0, False, False, {}
+
+    def render(self):
+        self._frame[:] = int(self._seen[0])
+        return self._frame
+
+
+TAKEN = np.zeros(1, np.float32)
+
+
+def counting(observation, rng):
+    TAKEN[:] = observation
+    return TAKEN
+
+
+gymnasium.register("Toy/Reusing-v0", f"{HERE}:Reusing")
