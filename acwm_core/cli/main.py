@@ -40,7 +40,8 @@ class AcwmGroup(click.Group):
         brought = catalog().registry("command")
         after = {n: str(each.defaults.get("after")) for n, each in brought.components().items()}
         opening = [name for name, place in after.items() if place == "acwm"]
-        names = dict.fromkeys([*opening, *self.commands, *(each.name for each in brought)])
+        whole = (each.name for each in brought if "." not in each.name)
+        names = dict.fromkeys([*opening, *self.commands, *whole])
 
         def followed(name: str) -> Iterator[str]:
             yield name
@@ -52,9 +53,17 @@ class AcwmGroup(click.Group):
         return list(dict.fromkeys([*placed, *names]))  # `names` adds those that form a circle
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command; a command of a plugin is imported now."""
+        """Return a command; a command of a plugin is imported now.
+
+        A plugin adds to a group of another one by a name such as ``"data.report"``.
+        """
         found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
         command = brought[cmd_name].load() if found is None and cmd_name in brought else found
+        if isinstance(command, click.Group):
+            for each in brought:
+                group, _, name = each.name.partition(".")
+                if name and group == cmd_name:
+                    command.add_command(each.load(), name)
         if command and ctx.resilient_parsing:  # shell completion
             from acwm_core.cli.completion import COMPLETIONS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -17,6 +18,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_formats.alignment import Alignment
 from acwm_formats.reading import ImportOptions
 from acwm_formats.recordings import import_dataset
+from acwm_formats.survey.survey import short_form, survey
 from acwm_formats.timeline import (
     ActionFacts,
     RecordedDataset,
@@ -58,7 +60,7 @@ def write_dataset(
         summary: one sentence about the data.
         alignment: what to do about arrays that do not fit together; by default they are refused.
         workers: number of processes to read and encode in; they require picklable `splits`.
-        progress: whether to show a progress bar on the terminal.
+        progress: whether to show a progress bar on the terminal, and what was found in the data.
 
     Returns:
         The card of the folder.
@@ -86,7 +88,10 @@ def write_dataset(
         summary=summary,
     )
     options = ImportOptions(size=size, alignment=alignment or Alignment())
-    return import_dataset(recorded, out, options, workers=workers, progress=progress)
+    made = import_dataset(recorded, out, options, workers=workers, progress=progress)
+    if progress:
+        print(*short_form(survey(out)), sep="\n", file=sys.stderr)
+    return made
 
 
 def _field(recording: Recording | TimedRecording, name: str, unit: str) -> StateField:

@@ -232,6 +232,7 @@ def import_format(
     run the same command again to continue.
     """
     from acwm_formats.recordings import import_dataset
+    from acwm_formats.survey.survey import short_form, survey
     from acwm_formats.timeline import RecordedDataset
 
     options = import_options(**asked)
@@ -242,6 +243,8 @@ def import_format(
         made = ", ".join(f"{count} {split}" for split, count in card.splits.items())
         click.echo(f"{out / name} holds {made} episodes of {card.environment.name}")
         _print_notes(card.source)
+        for line in short_form(survey(out / name)):
+            click.echo(line)
         click.echo(f"next: acwm fit small data.path={out / name}")
 
 

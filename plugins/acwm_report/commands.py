@@ -1,4 +1,4 @@
-"""`acwm evaluate`, `report`, `compare` and `leaderboard`."""
+"""`acwm evaluate`, `report`, `compare` and `leaderboard`, and `acwm data report`."""
 
 from __future__ import annotations
 
@@ -141,3 +141,22 @@ def leaderboard(folder: Path, out: Path | None) -> None:
     for name, why in found.broken.items():
         click.echo(f"left out {name}: {why}", err=True)
     click.echo(page)
+
+
+@click.command()
+@click.argument("path", type=DATASET)
+@click.option("--out", type=OUT_FILE, help="Output .html; report.html in PATH by default.")
+def data_report(path: Path, out: Path | None) -> None:
+    """Write a page about the dataset PATH, and print what is wrong with it.
+
+    One self-contained HTML file: sample videos, lengths, the range and histogram of each action,
+    defective frames, test episodes that equal training episodes, and whether the video follows the
+    actions, with what delay.
+    """
+    from acwm_formats.survey.survey import short_form, survey
+    from acwm_report.data_page import write_data_report
+
+    found = survey(path)
+    for line in short_form(found)[:-1]:
+        click.echo(line)
+    click.echo(write_data_report(found, out or path / "report.html"))

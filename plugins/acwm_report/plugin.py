@@ -5,7 +5,12 @@ from acwm_core.plugins import Registry, hookimpl
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add `acwm evaluate`, `acwm report`, `acwm compare` and `acwm leaderboard`."""
+    """Add `evaluate`, `report`, `compare` and `leaderboard`, and `report` to the group `data`."""
+    registry.add(
+        "data.report",
+        "acwm_report.commands:data_report",
+        summary="write a page about a dataset",
+    )
     registry.add(
         "evaluate",
         "acwm_report.commands:evaluate",

@@ -1,0 +1,1 @@
+"""What a dataset tells about itself: lengths, actions, frames, twins, and what follows what."""

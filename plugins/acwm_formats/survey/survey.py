@@ -1,0 +1,206 @@
+"""`survey`: look at a dataset and say what is good and bad in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.remote import data_folder
+from acwm_core.env.episode import Split
+from acwm_formats.survey.actions import ActionSummary, action_facts
+from acwm_formats.survey.following import SHIFTS, Following, Moments, following
+from acwm_formats.survey.frames import FrameFacts
+from acwm_formats.survey.motion import small
+from acwm_formats.survey.sample import stretches
+from acwm_formats.survey.twins import Twins, twins
+
+SURE = 0.9  # confidence from which a delay is stated and a shift is advised
+
+PHRASES = {
+    "dark": "black",
+    "flat": "of one colour",
+    "repeated": "repeated amid motion, as when dropped frames are filled or a video is stretched",
+    "frozen": "frozen while actions change",
+    "blurred": "far less sharp than those around them",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about a dataset.
+
+    Attributes:
+        level: ``"bad"`` if a model would learn something wrong or nothing, ``"note"`` if it is for
+            the reader to judge, ``"good"`` if it is as it should be.
+        text: the sentence.
+    """
+
+    level: Literal["bad", "note", "good"]
+    text: str
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was found in a dataset.
+
+    Attributes:
+        path: the data folder.
+        card: its card.
+        lengths: frames of every episode, by split.
+        actions: each action.
+        frames: counts of defective frames in the sample.
+        following: whether the video follows the actions; None if that cannot be told.
+        twins: test episodes that nearly equal training episodes.
+        compared: number of test episodes that were compared.
+        findings: what to know first; the worst come first.
+    """
+
+    path: Path
+    card: DatasetCard
+    lengths: dict[Split, list[int]]
+    actions: list[ActionSummary]
+    frames: FrameFacts
+    following: Following | None
+    twins: list[Twins]
+    compared: int
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All sentences, the bad ones first."""
+        every = [*_of_following(self), *_of_actions(self), *_of_frames(self), *_of_twins(self)]
+        return sorted(every, key=lambda each: ("bad", "note", "good").index(each.level))
+
+    @property
+    def headline(self) -> str:
+        """The verdict: whether the video follows the actions, and when."""
+        found = self.following
+        if found is None:
+            return "Too little to tell whether the video follows the actions"
+        if not found.follows:
+            return "Nothing in the video follows the actions"
+        if found.delay is None:
+            return "The video follows the actions; when cannot be told"
+        if found.confidence < SURE:
+            return "The video follows the actions; the delay is uncertain"
+        if not found.delay:
+            return "The video follows the actions, at once"
+        late = "late" if found.delay > 0 else "early"
+        return f"The video follows the actions {_frames(abs(found.delay))} {late}"
+
+
+def survey(path: str | Path) -> Survey:
+    """Look at the data folder `path`.
+
+    A sample is read, one stretch at a time, so memory and time hardly depend on the number of
+    episodes.
+
+    Raises:
+        DataError: there is no dataset, or it is unfinished or damaged.
+    """
+    path = data_folder(path)
+    card = DatasetCard.read(path)
+    data: dict[Split, EpisodeDataset] = {
+        split: EpisodeDataset(path, split) for split in card.splits
+    }
+    frames, moments = FrameFacts(), list[Moments]()
+    for each in stretches(data):
+        frames.add((each.split, each.episode, each.start), each.video, each.actions)
+        place = each.split, each.episode
+        moments.append(Moments(place, each.start, small(each.video), each.actions))
+    found, compared = twins(data)
+    return Survey(
+        path=path,
+        card=card,
+        lengths={split: each.lengths for split, each in data.items()},
+        actions=action_facts(data, card.environment.action),
+        frames=frames,
+        following=following(moments),
+        twins=found,
+        compared=compared,
+    )
+
+
+def short_form(found: Survey) -> list[str]:
+    """The verdict and what is wrong, in lines for a terminal."""
+    marks = {"bad": "✗", "note": "·", "good": "✓"}
+    lines = [f"{marks[each.level]} {each.text}" for each in found.findings]
+    return [*lines, f"all of it, with videos: acwm data report {found.path}"]
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame" if count == 1 else f"{count} frames"
+
+
+def _sure(confidence: float) -> str:
+    return "over 99 %" if confidence > 0.99 else f"{confidence:.0%}"
+
+
+def _of_following(found: Survey) -> Iterator[Finding]:
+    seen, says = found.following, found.headline
+    if seen is None:
+        why = "it takes at least four episodes of a dozen frames, and actions that change"
+        yield Finding("note", f"{says}: {why}")
+    elif not seen.follows:
+        why = (
+            f"in {seen.episodes} episodes, frames tell no more of their own actions than others do"
+        )
+        yield Finding("bad", f"{says}: {why}; a model would learn to ignore them")
+    elif seen.delay is None:
+        yield Finding("note", f"{says}: actions change too steadily")
+    elif seen.confidence < SURE:
+        likely = f"{_frames(seen.delay)} in {seen.confidence:.0%} of resamples"
+        yield Finding("note", f"{says} ({likely}): more episodes would settle it")
+    elif seen.delay:
+        edge = " (or more: no larger delay was tried)" if abs(seen.delay) == SHIFTS else ""
+        advice = f"import it with --shift {seen.delay} if that is not how the machine is"
+        yield Finding("bad", f"{says}{edge}, confidence {_sure(seen.confidence)}: {advice}")
+    else:
+        yield Finding("good", f"{says}: delay 0, confidence {_sure(seen.confidence)}")
+
+
+def _of_actions(found: Survey) -> Iterator[Finding]:
+    constant = [each.name for each in found.actions if each.constant]
+    if constant:
+        yield Finding("note", f"constant: {', '.join(constant)}; nothing can be learned of them")
+    recorded = bool(found.card.source)  # the bounds of a simulator are not taken from its data
+    for each in found.actions:
+        if each.narrow is not None and not each.constant:
+            near, far = each.quantiles
+            text = (
+                f"{each.name} has outliers: 98 % of its values lie from {near:.4g} to {far:.4g}, "
+                f"in {each.narrow:.1%} of its bounds {each.bounds[0]:.4g} to {each.bounds[1]:.4g}"
+            )
+            advice = "; import it with --bounds quantile"
+            yield Finding("bad", text + advice) if recorded else Finding("note", text)
+        if each.outside:
+            yield Finding("note", f"{each.outside:.2%} of {each.name} are out of its bounds")
+
+
+def _of_frames(found: Survey) -> Iterator[Finding]:
+    facts = found.frames
+    if not any(getattr(facts, name) for name in PHRASES):
+        yield Finding("good", f"{facts.frames:,} frames were looked at; none is defective")
+    for name, phrase in PHRASES.items():
+        count = getattr(facts, name)
+        if not count:
+            continue
+        split, episode, frame = facts.examples[name][0]
+        where = f"e.g. frame {frame} of {split} {episode}"
+        level = "bad" if count > 0.05 * facts.frames else "note"
+        yield Finding(level, f"{count} of {facts.frames:,} frames are {phrase} ({where})")
+
+
+def _of_twins(found: Survey) -> Iterator[Finding]:
+    if found.twins:
+        first, count = found.twins[0], len(found.twins)
+        yield Finding(
+            "bad",
+            f"{count} of {found.compared} test episodes nearly equal training episodes, e.g. "
+            f"{first.split} {first.episode} and train {first.trained}: scores will be too good",
+        )
+    elif found.compared:
+        yield Finding("good", f"none of {found.compared} test episodes equals a training episode")
