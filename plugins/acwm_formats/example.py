@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from acwm_core.data.video import write_mp4
 from acwm_formats.format import Format, export_dataset
 from acwm_formats.recordings import import_dataset
 from acwm_formats.rollouts import Gymnasium
@@ -47,6 +48,21 @@ class Square(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 gymnasium.register("acwm_formats/Square-v0", f"{Square.__module__}:Square")
+
+
+def write_example_videos(folder: Path) -> None:
+    """Write rollouts of `Square` as MP4 files of 10 frames per second, with a CSV beside each."""
+    for seed, length in enumerate((6, 7, 8)):
+        env, rng = Square(), np.random.default_rng(seed)
+        env.reset(seed=seed)
+        frames, lines = [env.render()], ["time,right,down"]
+        for index in range(length - 1):
+            down, right = rng.uniform(-1, 1, 2)
+            env.step(np.array([down, right], np.float32))
+            frames.append(env.render())
+            lines.append(f"{index / 10},{right},{down}")
+        write_mp4(folder / f"square_{seed}.mp4", np.stack(frames))
+        (folder / f"square_{seed}.csv").write_text("\n".join(lines), encoding="utf-8")
 
 
 def exported_example(folder: Path, target: Format) -> Path:

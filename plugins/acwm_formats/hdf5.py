@@ -1,22 +1,101 @@
-"""The format HDF5: one file per split, with bit-exact data."""
+"""The format HDF5: read in several layouts, written as one file per split with bit-exact data."""
 
 from __future__ import annotations
 
+import functools
 import io
 import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 
-from acwm_core.env.episode import Episode
+from acwm_core.data.card import UNREADABLE, DatasetCard
+from acwm_core.env.card import EnvironmentCard
+from acwm_core.env.episode import SPLITS, Episode, Split
+from acwm_core.errors import DataError
+from acwm_core.files import parse_json
+from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
+from acwm_formats.hdf5_layouts import (
+    Layout,
+    episodes_in,
+    files_of,
+    layout_of,
+    opened,
+)
+from acwm_formats.hdf5_recordings import HDF5Recordings
+from acwm_formats.names import exact, pair, typed, word, words
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Recordings
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 class HDF5(Format):
-    """HDF5: a file per split."""
+    """HDF5: robomimic, LIBERO, ACT/ALOHA, acwm's own and others are read; acwm's own is written."""
+
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether it is or holds HDF5 files, in a layout that is known."""
+        files = files_of(path)
+        if not files:
+            return False
+        with opened(files[0]) as file:
+            return layout_of(file) is not None
+
+    def read(
+        self,
+        root: Path,
+        *,
+        video: str | None = None,
+        actions: str | None = None,
+        states: str | None = None,
+        rate: float | None = None,
+        pixel_range: tuple[int, ...] | None = None,
+    ) -> RecordedDataset:
+        """Import an HDF5 file, or a folder of them.
+
+        Layouts of robomimic, LIBERO, ACT/ALOHA and acwm are known. For any other, say where in the
+        group of an episode its frames and actions lie, e.g. --video obs/front --actions actions;
+        every group that has both is an episode.
+
+        Args:
+            root: the file or folder.
+            video: Path of the frames in an episode's group; several with a comma between.
+            actions: Path of the actions in an episode's group.
+            states: Paths of the states to keep, with commas between.
+            rate: Frames per second, if the files do not say it.
+            pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
+        """
+        root = Path(root)
+        files = files_of(root)
+        if not files:
+            raise DataError(f"{root} is no HDF5 file and holds none")
+        layout = _layout(files[0], video, actions, states)
+        if rate is None and layout.rate is None:
+            raise DataError(
+                f"{files[0]} does not say how many frames it has per second: give --rate"
+            )
+        stated = exact(rate) if rate else cast(Fraction, layout.rate)
+        reader = functools.partial(
+            HDF5Recordings, layout=layout, rate=stated, pixel_range=pair(pixel_range)
+        )
+        options = {"video": video, "actions": actions, "states": states, "rate": rate}
+        card = _card(files[0]) if layout.name == "acwm" else None
+        return RecordedDataset(
+            name=card.name if card else word(root),
+            splits=_splits(files, layout, reader),
+            facts={"kind": "hdf5", "name": root.resolve().name, "layout": layout.name}
+            | {"bytes": sum(path.stat().st_size for path in files), "files": len(files)},
+            options=options | {"pixel_range": typed(pixel_range)},
+            actions=_action(card, layout),
+            state=card.state if card and states is None else None,
+            notes=(layout.note,) if layout.note and not rate else (),
+            summary=card.summary if card else f"Recorded in the layout of {layout.name}",
+        )
 
     def write(self, export: Export) -> None:
         """Write HDF5: one file per split, with bit-exact data and the ground truth.
@@ -46,8 +125,81 @@ class HDF5(Format):
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
-        """None: it is only written."""
-        return {}
+        """An example that `write` made."""
+        return {"root": exported_example(folder, cls())}
+
+
+def _layout(path: Path, video: str | None, actions: str | None, states: str | None) -> Layout:
+    """The layout of a file, with what the user says in the place of what is known."""
+    with opened(path) as file:
+        known = layout_of(file)
+    if known is None and (video is None or actions is None):
+        raise DataError(
+            f"{path} is in no layout that is known: give --video and --actions, the paths of "
+            "frames and actions in the group of an episode"
+        )
+    told = Layout("its owner", _paths(video), (actions or "").strip("/"), _paths(states))
+    if known is None:
+        return told
+    return replace(
+        known,
+        cameras=told.cameras or known.cameras,
+        actions=told.actions or known.actions,
+        states=known.states if states is None else told.states,
+    )
+
+
+def _paths(text: str | None) -> dict[str, str]:
+    """Paths with a comma between, by a name for each."""
+    return {path.strip("/").replace("/", "."): path.strip("/") for path in words(text)}
+
+
+def _splits(
+    files: Sequence[Path],
+    layout: Layout,
+    reader: Callable[[Sequence[tuple[Path, str]]], Recordings],
+) -> Recordings | dict[Split, Recordings]:
+    """The episodes by split, if the files say it, and else all."""
+    found: dict[Split | None, list[tuple[Path, str]]] = {}
+    for path in files:
+        with opened(path) as file:
+            names, tests = episodes_in(file, layout), _tests(file)
+            own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
+            for name in names:
+                split = cast(
+                    Split | None, own or (tests and tests.get(name.split("/")[-1], "train"))
+                )
+                found.setdefault(split, []).append((path, name))
+    if not found:
+        what = " and ".join((layout.actions, *layout.cameras.values()))
+        raise DataError(f"{files[0]} has no group with {what}")
+    if None in found:
+        return reader([place for places in found.values() for place in places])
+    return {split: reader(places) for split, places in found.items() if split}
+
+
+def _tests(file: Any) -> dict[str, Split] | None:
+    """The demonstrations that robomimic sets aside for validation."""
+    mask = file.get("mask/valid")
+    if not isinstance(mask, h5py.Dataset):
+        return None
+    return {bytes(name).decode(): "ind_test" for name in mask[()]}
+
+
+def _action(card: EnvironmentCard | None, layout: Layout) -> ActionFacts:
+    if card is None:
+        return ActionFacts(kind=layout.kind)
+    spec = card.action
+    return ActionFacts(spec.names, spec.units, spec.kind, (spec.low, spec.high))
+
+
+def _card(path: Path) -> EnvironmentCard:
+    """The card in a file that acwm wrote."""
+    with opened(path) as file:
+        try:
+            return DatasetCard.from_dict(parse_json(file.attrs["card"])).environment
+        except UNREADABLE as error:
+            raise DataError(f"{path} has no card that can be read ({error})") from error
 
 
 class _PatientFile(io.FileIO):

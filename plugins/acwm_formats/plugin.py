@@ -16,7 +16,12 @@ def register_kinds(registry: Registry) -> None:
 
 @hookimpl
 def register_formats(registry: Registry) -> None:
-    """Add formats of robot recordings, rollouts, the published release, and of every bit."""
+    """Add formats of videos and arrays, robot recordings, rollouts, and the published release."""
+    registry.add(
+        "videos",
+        "acwm_formats.videos:Videos",
+        summary="a folder of videos or pictures, with tables of actions; only read",
+    )
     registry.add(
         "lerobot",
         "acwm_formats.lerobot:LeRobot",
@@ -35,9 +40,30 @@ def register_formats(registry: Registry) -> None:
     registry.add(
         "hdf5",
         "acwm_formats.hdf5:HDF5",
-        summary="a file per split with every bit and the ground truth; only written",
+        summary="robomimic, LIBERO, ACT/ALOHA, any other layout; written with every bit",
         extra="hdf5",
         requires=("h5py",),
+    )
+    registry.add(
+        "zarr",
+        "acwm_formats.zarr_replay:ZarrReplay",
+        summary="a replay buffer as diffusion policy publishes it; only read",
+        extra="zarr",
+        requires=("zarr",),
+    )
+    registry.add(
+        "minari",
+        "acwm_formats.minari_datasets:Minari",
+        summary="a dataset of Minari with images; only read",
+        extra="minari",
+        requires=("minari", "h5py"),
+    )
+    registry.add(
+        "mcap",
+        "acwm_formats.mcap_logs:MCAP",
+        summary="logs with compressed images and a topic of numbers; only read",
+        extra="mcap",
+        requires=("mcap", "mcap_ros2", "mcap_protobuf"),
     )
 
 

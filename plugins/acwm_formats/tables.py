@@ -79,7 +79,10 @@ def number_column(table: Table, name: str, path: Path) -> NDArray[np.float64]:
 
 def holds_numbers(column: NDArray[Any]) -> bool:
     """Whether a column holds numbers, at least some: one wrong word does not make it text."""
-    return column.dtype.kind in "fiub" or any(_is_number(value) for value in column.tolist())
+    values = column.tolist()
+    return column.dtype.kind in "fiub" or any(
+        _is_number(value.replace(",", ".") if isinstance(value, str) else value) for value in values
+    )
 
 
 def _is_number(value: Any) -> bool:

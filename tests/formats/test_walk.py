@@ -12,10 +12,13 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from tests.formats import release
+from tests.formats.corpus import arrays, files, logs
+from tests.formats.corpus.cases import Case, three
 from tests.formats.test_command_line import QUICK, QUICK_EVALUATION
 from tests.formats.test_from_lerobot import REFERENCE
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
+TAKES = Case("takes", three(), names=("take 1", "take 2", "take 3"), column="time")
 
 
 @pytest.fixture
@@ -24,6 +27,16 @@ def desk(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(REFERENCE / "video", "my_robot")
     release.environment(Path("release/kinematics/reacher"), length=5)
+    for folder, write in (("takes", files.videos), ("logs", logs.in_ros2)):
+        Path(folder).mkdir()
+        write(Path(folder), TAKES)
+    for write, name in (
+        (arrays.robomimic, "demo.hdf5"),
+        (arrays.mapped, "mine.h5"),
+        (arrays.replay, "pusht.zarr"),
+        (arrays.minari, "door"),
+    ):
+        write(Path(), TAKES)[0].rename(name)
     Path("recordings").mkdir()
     for index in range(4):
         frames, actions = release.moving_square(np.random.default_rng(index), 7, (32, 32))
@@ -34,7 +47,7 @@ def desk(tmp_path, monkeypatch):
 def test_every_step_works(desk):
     text = PAGE.read_text()
     commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)
-    assert len(commands) == 10
+    assert len(commands) == 16
     for line in commands:
         words = shlex.split(line)
         words += QUICK if words[0] == "fit" else ()
@@ -45,6 +58,7 @@ def test_every_step_works(desk):
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
     exec(compile(code, str(PAGE), "exec"), {"__name__": "walk"})
     made = {path.parent.name for path in Path("data").rglob("card.yaml")}
-    assert made == {"mine", "top", "rollouts", "reacher", "arm"}
+    shown = set(re.findall(r"--out data/(\w+)", text))
+    assert made == {*shown, "arm", "reacher"} - {"published"}
     assert DatasetCard.read("data/arm").splits == {"train": 2, "ind_test": 2}
     assert Path("runs/small/report.html").is_file()

@@ -127,7 +127,7 @@ def replay_3(folder, case):
 
 def minari(folder, case):
     """A dataset of Minari: one action fewer than observations."""
-    path = folder / "corpus" / "data"
+    path = folder.absolute() / "corpus" / "data"  # the library doubles relative paths
     path.mkdir(parents=True)
     first = images(case, case.episodes[0])
     space = gymnasium.spaces.Box(0, 255, first.shape[1:], np.uint8)

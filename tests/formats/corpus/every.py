@@ -163,7 +163,12 @@ TIMES = [
         only=(*VIDEOS, "lerobot"),
         refused="5 rows",
     ),
-    moments("a row less than frames", (*range(8),), (*range(7),)),
+    moments(
+        "a row less than frames",
+        (*range(8),),
+        (*range(7),),
+        only=("videos", "hdf5", "mcap"),
+    ),
     Case(
         "half the rate",
         three(),
@@ -216,7 +221,7 @@ def ragged(count):
 
 ACTIONS = [
     acting("of whole numbers", ramp(np.int64)),
-    acting("of bytes", ramp(np.uint8)),
+    acting("of bytes", ramp(np.uint8), only=("hdf5", "zarr", "videos")),
     acting("of float16", ramp(np.float16), only=("hdf5", "zarr", "videos")),
     acting("of float64", ramp(np.float64)),
     acting(

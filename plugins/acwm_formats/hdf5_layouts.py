@@ -1,0 +1,178 @@
+"""HDF5 files of robomimic, LIBERO, ACT/ALOHA and acwm, and of any other layout that is told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from acwm_core.env.card import ActionKind
+from acwm_core.errors import DataError
+from acwm_formats.images import CHANNELS
+from acwm_formats.names import natural
+
+ENDINGS = (".hdf5", ".h5")
+ALOHA_RATE = Fraction(50)  # the layout does not say it; all of its recorders have a step of 20 ms
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things lie in the group of an episode.
+
+    Attributes:
+        name: whose layout it is.
+        cameras: path of the frames by the name of the camera.
+        actions: path of the actions.
+        states: path of each state by its name.
+        rate: frames per second; None if the files do not say it.
+        kind: what actions command.
+        note: a sentence for people.
+    """
+
+    name: str
+    cameras: Mapping[str, str]
+    actions: str
+    states: Mapping[str, str] = field(default_factory=dict[str, str])
+    rate: Fraction | None = None
+    kind: ActionKind = "absolute"
+    note: str = ""
+
+
+def files_of(path: Path) -> list[Path]:
+    """The HDF5 files that `path` is or holds, in natural order."""
+    if path.is_file():
+        return [path] if h5py.is_hdf5(path) else []
+    if not path.is_dir():
+        return []
+    found = [each for each in path.iterdir() if each.suffix.lower() in ENDINGS]
+    return sorted(found, key=lambda each: natural(each.name))
+
+
+def opened(path: Path) -> Any:
+    """Open an HDF5 file that refers to no other.
+
+    Raises:
+        DataError: it is missing, damaged or has links to other files.
+    """
+    try:
+        file = h5py.File(path, "r")
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{path} cannot be read as HDF5 ({error})") from error
+    outside: list[str] = []
+    file.visititems_links(lambda name, link: _external(name, link, outside))
+    if outside:
+        raise DataError(f"{path} has a link to another file, {outside[0]}: copy what it names")
+    return file
+
+
+def _external(name: str, link: Any, outside: list[str]) -> None:
+    if isinstance(link, h5py.ExternalLink):
+        outside.append(name)
+
+
+def array(group: Any, name: str) -> Any:
+    """The dataset `name` of a group, whose data lies in the same file.
+
+    Raises:
+        DataError: there is none.
+    """
+    found = group.get(name)
+    if not isinstance(found, h5py.Dataset):
+        raise DataError(f"{group.file.filename} has no array {group.name.rstrip('/')}/{name}")
+    if found.external or found.is_virtual:
+        raise DataError(f"{group.file.filename} keeps {found.name} in another file: copy it")
+    return found
+
+
+def episodes_in(file: Any, layout: Layout) -> list[str]:
+    """The groups that hold what the layout names, in natural order."""
+    found = [
+        name
+        for name in _groups(file)
+        if layout.actions in (group := file[name])
+        and all(path in group for path in layout.cameras.values())
+    ]
+    return sorted(found, key=natural)
+
+
+def _groups(file: Any) -> Iterator[str]:
+    yield "/"
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Group) else None)
+    yield from names
+
+
+def layout_of(file: Any) -> Layout | None:
+    """The layout of a file, if it is one that is known."""
+    if file.attrs.get("format") == "acwm":
+        return _ours(file)
+    if "data" in file and isinstance(file["data"], h5py.Group) and len(file["data"]):
+        return _robomimic(file["data"])
+    if "action" in file and "observations/images" in file:
+        return _aloha(file)
+    return None
+
+
+def _ours(file: Any) -> Layout | None:
+    names = sorted(name for name in file if name.startswith("episode_"))
+    if not names:
+        return None
+    states = {name: f"states/{name}" for name in file[names[0]].get("states", ())}
+    rate = Fraction(json.loads(file.attrs["card"])["environment"]["fps"]).limit_denominator(10**6)
+    return Layout("acwm", {"video": "video"}, "actions", states, rate)
+
+
+def _robomimic(data: Any) -> Layout | None:
+    first = data[sorted(data, key=natural)[0]]
+    if "obs" not in first or "actions" not in first:
+        return None
+    seen, length = first["obs"], len(first["actions"])
+    cameras = {name: f"obs/{name}" for name in seen if is_video(seen[name])}
+    states = {name: f"obs/{name}" for name in seen if is_numbers(seen[name], length)}
+    libero = "bddl_file_name" in data.attrs or "problem_info" in data.attrs
+    name = "LIBERO" if libero else "robomimic"
+    return Layout(name, cameras, "actions", states, *_robosuite(data.attrs.get("env_args")))
+
+
+def _robosuite(env_args: Any) -> tuple[Fraction | None, ActionKind]:
+    """The control frequency and the kind of actions in the JSON of `env_args`."""
+    try:
+        settings = json.loads(env_args)["env_kwargs"]
+        rate = Fraction(settings["control_freq"]).limit_denominator(10**6)
+        relative = settings.get("controller_configs", {}).get("control_delta", False)
+    except (TypeError, ValueError, KeyError, AttributeError):
+        return None, "absolute"
+    return rate, "delta" if relative is True else "absolute"
+
+
+def _aloha(file: Any) -> Layout:
+    images, length = file["observations/images"], len(file["action"])
+    cameras = {name: f"observations/images/{name}" for name in images}
+    seen = file["observations"]
+    states = {name: f"observations/{name}" for name in seen if is_numbers(seen[name], length)}
+    note = "50 frames per second, which ALOHA's recorders have and its files do not say."
+    return Layout("ALOHA", cameras, "action", states, ALOHA_RATE, note=note)
+
+
+def is_video(item: Any) -> bool:
+    """Whether a dataset holds images: ``[T, H, W, C]``, ``[T, C, H, W]`` or depth ``[T, H, W]``."""
+    if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif":
+        return False
+    shape = item.shape
+    colours = len(shape) == 4 and (shape[3] in CHANNELS or shape[1] in CHANNELS)
+    return colours and min(sorted(shape[1:])[1:]) >= 8
+
+
+def is_numbers(item: Any, length: int) -> bool:
+    """Whether a dataset is a state: numbers with a row per frame, and no images."""
+    return (
+        isinstance(item, h5py.Dataset)
+        and item.dtype.kind in "fiub"
+        and item.ndim in (1, 2)
+        and len(item) in (length, length + 1)
+    )

@@ -1,0 +1,380 @@
+"""The format of who has none: a folder of videos, with a table of actions beside each."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError, suggest
+from acwm_formats.example import write_example_videos
+from acwm_formats.format import Format
+from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
+from acwm_formats.names import exact, natural, word, words
+from acwm_formats.tables import (
+    EPISODES,
+    FRAMES,
+    READERS,
+    TIMES,
+    Table,
+    action_columns,
+    holds_numbers,
+    number_column,
+    numbers,
+    read_table,
+    seconds,
+    special_column,
+)
+from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
+
+VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".gif")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+
+
+class Place(NamedTuple):
+    """Where one episode lies.
+
+    Attributes:
+        name: the name of its video or folder, without an ending.
+        cameras: a video file, or a folder of pictures, by the name of the camera.
+        table: the file with its actions; None if there is none, or one for all.
+    """
+
+    name: str
+    cameras: Mapping[str, Path]
+    table: Path | None
+
+
+class Columns(NamedTuple):
+    """What the columns of the tables are.
+
+    Attributes:
+        actions: names of the columns of actions.
+        states: names of the columns of states.
+        time: the column of times in seconds; None if there is none.
+        frame: the column of numbers of frames; None if there is none.
+        episode: the column that names the episode, in a table for all.
+    """
+
+    actions: tuple[str, ...]
+    states: tuple[str, ...]
+    time: str | None
+    frame: str | None
+    episode: str | None
+
+
+class Videos(Format):
+    """Videos or folders of pictures, with actions in tables beside them; only read."""
+
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether it holds videos or folders of pictures, and tables."""
+        if not path.is_dir():
+            return False
+        places = find_places(path)
+        return bool(places) and (any(place.table for place in places) or bool(_tables(path)))
+
+    def read(
+        self,
+        root: Path,
+        *,
+        actions: str | None = None,
+        columns: str | None = None,
+        states: str | None = None,
+        time: str | None = None,
+        rate: float | None = None,
+        from_first_row: bool = False,
+    ) -> RecordedDataset:
+        """Import a folder of videos, one episode each, with actions in a table beside each.
+
+        Each video in ROOT (mp4, mov, mkv, webm, avi, gif), or folder of pictures, has a table of
+        the same name: csv, tsv, npy, npz, json, jsonl or parquet. Or ROOT has a folder per episode,
+        with a video or folder of pictures per camera and one table. Or one table in ROOT is for
+        all, and a column of it, such as episode or video, tells which. Rows belong to frames by a
+        column of times (time, timestamp, t; time_ms and the like are in that unit), by a column
+        frame, or by their place.
+
+        Args:
+            root: the folder.
+            actions: Name of the table for all episodes, or of the one in each episode's folder.
+            columns: Names of the columns of actions, e.g. x,y; by default those called action…, or
+                all that hold numbers.
+            states: Names of the columns to keep as states; none by default.
+            time: Name of the column of times.
+            rate: Frames per second of folders of pictures.
+            from_first_row: Whether the first row was taken with the first frame, if the clocks of
+                table and video differ.
+        """
+        root = Path(root)
+        places = find_places(root, actions)
+        if not places:
+            raise DataError(f"{root} holds no video and no folder of pictures")
+        table = _shared(root, places, actions)
+        path = table or next((place.table for place in places if place.table), None)
+        if path is None:
+            endings = ", ".join(ending[1:] for ending in READERS)
+            raise DataError(f"{root} has no table of actions beside {places[0].name}: {endings}")
+        chosen = _columns(path, words(columns), words(states), time, shared=table is not None)
+        options = {"actions": actions, "columns": columns, "states": states, "time": time}
+        options |= {"rate": rate, "from_first_row": from_first_row}
+        return RecordedDataset(
+            name=word(root),
+            splits=VideoFolder(root, actions, digest(places), table, chosen, rate, from_first_row),
+            facts={"kind": "videos", "name": root.resolve().name, **_facts(places, table)},
+            options=options,
+            actions=ActionFacts(chosen.actions),
+            notes=_notes(root, places, path, chosen),
+            summary=f"Videos of {root.resolve().name}",
+        )
+
+    @classmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """Three short videos of a moving square, with a table of times and actions each."""
+        write_example_videos(folder)
+        return {"root": folder}
+
+
+@dataclass(frozen=True)
+class VideoFolder:
+    """The episodes of a folder, opened on request.
+
+    Attributes:
+        root: the folder.
+        actions: name of a table, as in `find_places`.
+        found: `digest` of what was found.
+        table: the table for all, if there is one.
+        columns: what the columns of tables are.
+        rate: frames per second of pictures.
+        from_first_row: whether the first row was taken with the first frame.
+    """
+
+    root: Path
+    actions: str | None
+    found: str
+    table: Path | None
+    columns: Columns
+    rate: float | None
+    from_first_row: bool
+
+    @property
+    def places(self) -> list[Place]:
+        """Where the episodes lie; each process looks for itself, as the list is long."""
+        return _places(self.root, self.actions, self.found)
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        return len(self.places)
+
+    def __getitem__(self, index: int) -> TimedRecording:
+        """Open one episode."""
+        place = self.places[index]
+        path = self.table or place.table
+        if path is None:
+            raise DataError(f"there is no table of actions beside {place.name}")
+        rows = _read_once(path, file_stamp(path)) if self.table else read_table(path)
+        if self.table and self.columns.episode:
+            rows = _rows_of(rows, self.columns.episode, index, self.places, path)
+        times = None
+        if self.columns.time:
+            times = seconds(rows, self.columns.time, path)
+        cameras = {name: self._frames(source, times) for name, source in place.cameras.items()}
+        first = next(iter(cameras.values()))
+        samples = self._samples(rows, path, self._same_clock(times, first.times, path))
+        rate = None
+        if isinstance(first, VideoFrames):
+            rate = video_index(first.path).rate
+        names = self.columns.states
+        states = {name: samples(number_column(rows, name, path)[:, None]) for name in names}
+        actions = samples(numbers(rows, self.columns.actions, path))
+        return TimedRecording(place.name, cameras, actions, states, rate)
+
+    def _frames(self, source: Path, times: NDArray[np.float64] | None) -> Frames:
+        """A video, or pictures with the times of `rate` or else of the table's rows."""
+        if source.is_file():
+            return VideoFrames(source)
+        paths = _pictures(source)
+        if self.rate:
+            times = regular_times(len(paths), exact(self.rate))
+        elif times is None or len(times) != len(paths):
+            raise DataError(f"{source} holds {len(paths)} pictures: give --rate, frames per second")
+        stamps = [path.stat() for path in paths]
+        stamp = f"{sum(s.st_size for s in stamps)} {max(s.st_mtime_ns for s in stamps)}"
+        return ImageFrames(paths, times, stamp=stamp)
+
+    def _same_clock(
+        self, times: NDArray[np.float64] | None, shown: NDArray[np.float64], path: Path
+    ) -> NDArray[np.float64] | None:
+        """The times of rows on the clock of the video."""
+        if times is None or not len(shown):
+            return times
+        if self.from_first_row:
+            return times - times[0] + shown[0]
+        if times[0] > shown[-1] or times[-1] < shown[0]:
+            raise DataError(
+                f"the times of {path} ({times[0]:g} to {times[-1]:g} s) are not those of the video "
+                f"({shown[0]:g} to {shown[-1]:g} s): give --from-first-row if the first row was "
+                "taken with the first frame"
+            )
+        return times
+
+    def _samples(
+        self, rows: Table, path: Path, times: NDArray[np.float64] | None
+    ) -> functools.partial[Samples]:
+        """Makes the samples of some values in rows of the table."""
+        frames = None
+        if times is None and self.columns.frame:
+            frames = number_column(rows, self.columns.frame, path).astype(np.int64)
+        return functools.partial(Samples, times=times, frames=frames)
+
+
+def find_places(root: Path, actions: str | None = None) -> list[Place]:
+    """The episodes in a folder, in natural order: 2 comes before 10."""
+    found: list[Place] = []
+    for path in sorted(root.iterdir(), key=_order):
+        if path.name.startswith((".", "_")):
+            continue
+        if path.suffix.lower() in VIDEOS and path.is_file():
+            found.append(Place(path.stem, {"video": path}, _table_of(root, path.stem)))
+        elif path.is_dir():
+            found += _folder(root, path, actions)
+    return found
+
+
+def _folder(root: Path, folder: Path, actions: str | None) -> list[Place]:
+    """The episode that a folder is: pictures, or a video or folder of pictures per camera."""
+    inner = [path for path in _tables(folder) if actions is None or path.name == actions]
+    table = inner[0] if len(inner) == 1 else _table_of(root, folder.name)
+    if _pictures(folder):
+        return [Place(folder.name, {"video": folder}, table)]
+    cameras = {
+        path.stem if path.is_file() else path.name: path
+        for path in sorted(folder.iterdir(), key=_order)
+        if path.suffix.lower() in VIDEOS or (path.is_dir() and _pictures(path))
+    }
+    if not cameras or len(inner) > 1:
+        return []
+    return [Place(folder.name, cameras, table)]
+
+
+@functools.lru_cache(maxsize=2)
+def _places(root: Path, actions: str | None, found: str) -> list[Place]:
+    places = find_places(root, actions)
+    if digest(places) != found:
+        raise DataError(f"files in {root} came or went during the import: start it again")
+    return places
+
+
+def digest(places: Sequence[Place]) -> str:
+    """What changes when episodes come, go or are called otherwise."""
+    return hashlib.sha256(repr(places).encode()).hexdigest()
+
+
+def _order(path: Path) -> list[tuple[int, str]]:
+    return natural(path.name)
+
+
+def _pictures(folder: Path) -> list[Path]:
+    found = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    return sorted(found, key=_order)
+
+
+def _tables(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in READERS)
+
+
+def _table_of(root: Path, stem: str) -> Path | None:
+    paths = (root / f"{stem}{ending}" for ending in READERS)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _shared(root: Path, places: Sequence[Place], actions: str | None) -> Path | None:
+    """The table for all episodes, if there is one."""
+    if actions and (root / actions).is_file():
+        return root / actions
+    if any(place.table for place in places):
+        return None
+    tables = _tables(root)
+    if len(tables) > 1:
+        names = ", ".join(path.name for path in tables)
+        raise DataError(f"{root} has several tables ({names}): give --actions NAME")
+    return tables[0] if tables else None
+
+
+@functools.lru_cache(maxsize=2)
+def _read_once(path: Path, _: str) -> Table:
+    return read_table(path)
+
+
+def _rows_of(table: Table, column: str, index: int, places: Sequence[Place], path: Path) -> Table:
+    """The rows of one episode, named by its video or by its place in natural order."""
+    values = table[column]
+    if values.dtype.kind in "iuf":
+        known = np.unique(values)
+        if not np.array_equal(known, np.arange(len(places))):
+            raise DataError(
+                f"the column {column} of {path} numbers {len(known)} episodes from {known[0]:g} to "
+                f"{known[-1]:g}, and there are {len(places)} videos: number them from 0, or use "
+                "names"
+            )
+        chosen = values == index
+    else:
+        place = places[index]
+        files = {place.name, *(source.name for source in place.cameras.values())}
+        chosen = np.array([str(value) in files for value in values])
+    if not chosen.any():
+        raise DataError(f"{path} has no row of {places[index].name} in the column {column}")
+    return {name: rows[chosen] for name, rows in table.items()}
+
+
+def _columns(
+    path: Path,
+    actions: tuple[str, ...],
+    states: tuple[str, ...],
+    time: str | None,
+    *,
+    shared: bool,
+) -> Columns:
+    """What the columns of a table are; the others have the same."""
+    table = read_table(path)
+    for name in (*actions, *states, *words(time)):
+        if name not in table:
+            raise DataError(f"{path} has no column {name!r}{suggest(name, table)}")
+    if not actions:
+        free = [name for name in action_columns(table) if name not in (*states, time)]
+        numeric = [name for name in free if holds_numbers(table[name])]
+        called = [name for name in numeric if re.match(r"actions?(\W|_|\d|$)", name.lower())]
+        actions = tuple(called or numeric)
+    if not actions:
+        raise DataError(f"{path} has no column of actions, only {', '.join(table)}")
+    episode = special_column(table, EPISODES) if shared else None
+    time = time or special_column(table, TIMES)
+    return Columns(actions, states, time, special_column(table, FRAMES), episode)
+
+
+def _facts(places: Sequence[Place], table: Path | None) -> dict[str, Any]:
+    """What identifies the folder without reading all of it."""
+    sources = [path for place in places for path in place.cameras.values()]
+    sources += [path for path in (table, *(place.table for place in places)) if path]
+    files = [path for path in sources if path.is_file()]
+    return {"episodes": len(places), "bytes": sum(path.stat().st_size for path in files)}
+
+
+def _notes(root: Path, places: Sequence[Place], path: Path, chosen: Columns) -> tuple[str, ...]:
+    left = [name for name in read_table(path) if name not in {*chosen.actions, *chosen.states}]
+    left = [name for name in left if name not in chosen[2:]]
+    notes = [f"Actions are the columns {', '.join(chosen.actions)}."]
+    if left:
+        notes.append(f"Columns that were left out: {', '.join(left)}.")
+    if chosen.time is None and chosen.frame is None:
+        notes.append("Rows belong to frames by their place: the tables have no column of times.")
+    used = {place.table for place in places} | {path}
+    if lone := [table.name for table in _tables(root) if table not in used]:
+        notes.append(f"Tables without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
+    return tuple(notes)

@@ -1,0 +1,252 @@
+"""The format of diffusion policy's replay buffers: Zarr arrays of all episodes in a row."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.errors import BaseZarrError
+from zarr.storage import ZipStore
+
+from acwm_core.errors import DataError, suggest
+from acwm_formats.format import Format
+from acwm_formats.frames import ImageFrames, regular_times
+from acwm_formats.images import CHANNELS
+from acwm_formats.names import exact, pair, typed, word, words
+from acwm_formats.timeline import RecordedDataset, Samples, TimedRecording
+
+ENDS = "meta/episode_ends"
+ACTIONS = ("action", "actions")
+CODECS = (
+    *(
+        "blosc",
+        "zstd",
+        "zlib",
+        "lz4",
+        "gzip",
+        "bz2",
+        "lzma",
+        "shuffle",
+        "delta",
+        "fixedscaleoffset",
+    ),
+    *("BloscCodec", "ZstdCodec", "GzipCodec", "BytesCodec", "TransposeCodec", "Crc32cCodec"),
+    *("ShardingCodec", "imagecodecs_jpegxl", "imagecodecs_jpeg2k", "imagecodecs_webp"),
+)
+"""Codecs of numbers and images. Others are refused: those of objects run code as they read."""
+
+BROKEN = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, BaseZarrError)
+"""Exceptions of the library for what is damaged."""
+
+
+class ZarrReplay(Format):
+    """Zarr replay buffers as diffusion policy publishes them; only read."""
+
+    @classmethod
+    def detect(cls, path: Path) -> bool:
+        """Whether there is an array ``meta/episode_ends``, or it is called ``.zarr.zip``."""
+        if path.name.endswith(".zarr.zip"):
+            return path.is_file()
+        names = (".zarray", "zarr.json")
+        return any((path / ENDS / name).is_file() for name in names)
+
+    def read(
+        self,
+        root: Path,
+        *,
+        rate: float,
+        video: str | None = None,
+        actions: str | None = None,
+        states: str | None = None,
+        pixel_range: tuple[int, ...] | None = None,
+    ) -> RecordedDataset:
+        """Import a Zarr replay buffer with data/… of all episodes and meta/episode_ends.
+
+        Args:
+            root: the folder, or a .zarr.zip file.
+            rate: Frames per second, which the format does not say.
+            video: Names of the frames in data, with a comma between; by default all images.
+            actions: Name of the actions in data; action by default.
+            states: Names of the states to keep; by default all other numbers.
+            pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
+        """
+        buffer = Buffer(Path(root))
+        found = {name: buffer.array(f"data/{name}") for name in buffer.names()}
+        for name, array in found.items():
+            if array.shape[0] != buffer.ends[-1]:
+                rows = f"{array.shape[0]} rows, and the last episode ends at {buffer.ends[-1]}"
+                raise DataError(f"data/{name} of {root} has {rows}")
+        cameras = _chosen(buffer, video, found, [n for n in found if _shows(found[n])])
+        action = _chosen(buffer, actions, found, [name for name in ACTIONS if name in found])[:1]
+        if not cameras or not action:
+            missing = "actions: give --actions NAME" if cameras else "images: give --video NAME"
+            raise DataError(f"data/ of {root} has {', '.join(found)}, and no {missing}")
+        others = [n for n in found if n not in (*cameras, *action) and found[n].ndim == 2]
+        kept = tuple(_chosen(buffer, states, found, others))
+        options = {"rate": rate, "video": video, "actions": actions, "states": states}
+        name = Path(root).resolve().name
+        return RecordedDataset(
+            name=word(Path(root)),
+            splits=ZarrRecordings(
+                buffer, tuple(cameras), action[0], kept, exact(rate), pair(pixel_range)
+            ),
+            facts={
+                "kind": "zarr",
+                "name": name,
+                "episodes": len(buffer.ends),
+                "frames": buffer.ends[-1],
+            },
+            options=options | {"pixel_range": typed(pixel_range)},
+            summary=f"The replay buffer {name}",
+        )
+
+    @classmethod
+    def example(cls, folder: Path) -> dict[str, Any]:
+        """A buffer of three short episodes."""
+        place, rng = folder / "square.zarr", np.random.default_rng(0)
+        store = zarr.open_group(str(place), mode="w", zarr_format=2)
+        frames = rng.integers(0, 256, (18, 32, 32, 3), np.uint8)
+        store.create_array("data/img", data=frames, chunks=(1, 32, 32, 3))
+        store.create_array("data/action", data=rng.uniform(-1, 1, (18, 2)).astype(np.float32))
+        store.create_array("data/state", data=rng.uniform(-1, 1, (18, 5)).astype(np.float32))
+        store.create_array(ENDS, data=np.array([5, 11, 18]))
+        return {"root": place, "rate": 10.0}
+
+
+@dataclass(frozen=True)
+class ZarrRecordings:
+    """The episodes of a replay buffer, opened on request."""
+
+    buffer: Buffer
+    cameras: tuple[str, ...]
+    actions: str
+    states: tuple[str, ...]
+    rate: Fraction
+    pixel_range: tuple[float, float] | None
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        return len(self.buffer.ends)
+
+    def __getitem__(self, index: int) -> TimedRecording:
+        """Open one episode."""
+        start, stop = [0, *self.buffer.ends][index : index + 2]
+        times = regular_times(stop - start, self.rate)
+
+        def rows(name: str) -> Samples:
+            return Samples(self.buffer.rows(f"data/{name}", start, stop))
+
+        cameras = {
+            name: ImageFrames(
+                StoredImages(self.buffer, name, start, stop),
+                times,
+                self.pixel_range,
+                stamp=f"{name} {start} {stop}",
+            )
+            for name in self.cameras
+        }
+        states = {name: rows(name) for name in self.states}
+        return TimedRecording(f"episode {index}", cameras, rows(self.actions), states, self.rate)
+
+
+@dataclass(frozen=True)
+class StoredImages(Sequence[Any]):
+    """Images `start` to `stop` of an array, read one by one."""
+
+    buffer: Buffer
+    name: str
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def __getitem__(self, index: Any) -> Any:
+        place = self.start + index
+        return self.buffer.rows(f"data/{self.name}", place, place + 1)[0]
+
+
+class Buffer:
+    """The arrays of a replay buffer; opened anew in every process.
+
+    Raises:
+        DataError: it is no Zarr group that can be read.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._found: dict[str, Any] = {}
+        try:
+            store: Any = ZipStore(root, mode="r") if root.is_file() else str(root)
+            self._group: Any = zarr.open_group(store, mode="r")
+        except (OSError, *BROKEN) as error:
+            raise DataError(f"{root} is no Zarr group that can be read ({error})") from error
+
+    def __reduce__(self) -> Any:
+        return Buffer, (self.root,)
+
+    def names(self) -> list[str]:
+        """The names of the arrays in ``data``."""
+        try:
+            return sorted(name for name, _ in self._group["data"].arrays())
+        except (OSError, *BROKEN) as error:
+            raise DataError(f"{self.root} has no group data that can be read ({error})") from error
+
+    def array(self, name: str) -> Any:
+        """An array of numbers whose codecs run no code.
+
+        Raises:
+            DataError: there is no such array, or it cannot be read.
+        """
+        if name in self._found:
+            return self._found[name]
+        try:
+            array = self._group[name]
+            codecs = [*array.filters, *array.compressors]
+            used = [getattr(codec, "codec_id", type(codec).__name__) for codec in codecs]
+        except (OSError, *BROKEN) as error:
+            raise DataError(
+                f"{self.root} has no array {name} that can be read ({error})"
+            ) from error
+        if array.dtype.kind not in "fiub" or not {*used} <= {*CODECS}:
+            raise DataError(f"{name} of {self.root} holds {array.dtype} by {used}, not numbers")
+        self._found[name] = array
+        return array
+
+    def rows(self, name: str, start: int, stop: int | None) -> NDArray[Any]:
+        """Rows `start` to `stop` of an array."""
+        try:
+            return np.asarray(self.array(name)[start:stop])
+        except (OSError, *BROKEN) as error:
+            raise DataError(f"{name} of {self.root} cannot be read ({error})") from error
+
+    @functools.cached_property
+    def ends(self) -> list[int]:
+        """Where each episode ends."""
+        ends = [int(end) for end in self.rows(ENDS, 0, None)]
+        if not ends or any(end <= start for start, end in itertools.pairwise([0, *ends])):
+            raise DataError(f"{ENDS} of {self.root} does not grow with each episode: {ends[:5]}")
+        return ends
+
+
+def _shows(array: Any) -> bool:
+    return array.ndim == 4 and (array.shape[3] in CHANNELS or array.shape[1] in CHANNELS)
+
+
+def _chosen(
+    buffer: Buffer, text: str | None, found: Mapping[str, Any], default: list[str]
+) -> list[str]:
+    """The names in `text`, or the default ones."""
+    names = default if text is None else list(words(text))
+    for name in names:
+        if name not in found:
+            raise DataError(f"{buffer.root} has no data/{name}{suggest(name, found)}")
+    return names

@@ -1,0 +1,79 @@
+"""Logs in MCAP: times of the log, topics by name, three encodings."""
+
+import json
+
+import mcap.writer
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from acwm_core.errors import DataError
+from acwm_formats.mcap_logs import MCAP
+from tests.formats.corpus import logs
+from tests.formats.corpus.cases import Case, at, episode
+from tests.formats.corpus.pictures import number_in
+
+LATE = Case("late", (episode(times=at(*range(2, 10)), row_times=at(*range(8))),))
+
+
+@pytest.mark.parametrize("write", [logs.in_json, logs.in_ros2])
+def test_times_count_from_the_first_frame(tmp_path, write):
+    write(tmp_path, LATE)
+    found = MCAP().read(tmp_path)
+    recording = found.splits[0]
+    frames = recording.cameras["camera"]
+    np.testing.assert_allclose(frames.times, np.arange(8) / 10)
+    np.testing.assert_allclose(recording.actions.times, np.arange(-2, 6) / 10)
+    np.testing.assert_array_equal(recording.actions.values, LATE.episodes[0].rows)
+    assert [int(number_in(frame)) for frame in frames.read([0, 3, 3, 7])] == [0, 3, 3, 7]
+    assert [int(number_in(frame)) for frame in frames.read([1])] == [1]
+
+
+def protobuf_log(path, topics):
+    """A log of one Protobuf message per topic, with a field `force` and a header."""
+    pool = descriptor_pool.DescriptorPool()
+    file = descriptor_pb2.FileDescriptorProto(name="wrench.proto", syntax="proto3")
+    kind = file.message_type.add(name="Wrench")
+    double = descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE
+    for number, name in enumerate(("stamp", "force", "torque"), 1):
+        kind.field.add(name=name, number=number, type=double, label=1)
+    pool.Add(file)
+    wrench = message_factory.GetMessageClass(pool.FindMessageTypeByName("Wrench"))
+    schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    with path.open("wb") as opened:
+        writer = mcap.writer.Writer(opened)
+        writer.start()
+        known = writer.register_schema("Wrench", "protobuf", schema)
+        image = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        camera = writer.register_channel("/camera", "json", image)
+        for place, topic in enumerate(topics):
+            channel = writer.register_channel(topic, "protobuf", known)
+            data = wrench(stamp=9, force=place, torque=2).SerializeToString()
+            writer.add_message(channel, 5, data, 5)
+        writer.add_message(camera, 5, json.dumps({"data": ""}).encode(), 5)
+        writer.finish()
+
+
+def test_protobuf_and_a_field(tmp_path):
+    protobuf_log(tmp_path / "a.mcap", ["/arm"])
+    found = MCAP().read(tmp_path)
+    assert found.actions.names == ("force", "torque")
+    found = MCAP().read(tmp_path, actions="/arm:torque", states="/arm:force")
+    assert found.actions.names == ("torque",)
+    assert found.splits[0].states["arm:force"].values.tolist() == [[0.0]]
+
+
+def test_the_topic_must_be_told_if_there_are_two(tmp_path):
+    protobuf_log(tmp_path / "a.mcap", ["/arm", "/hand"])
+    with pytest.raises(DataError, match=r"2 topics of numbers \(/arm, /hand\): give --actions"):
+        MCAP().read(tmp_path)
+    with pytest.raises(DataError, match="did you mean '/hand'"):
+        MCAP().read(tmp_path, actions="/hnd")
+
+
+def test_a_log_that_is_cut_off(tmp_path):
+    logs.in_json(tmp_path, LATE)
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(DataError, match=r"the log .* cannot be read"):
+        MCAP().read(tmp_path)

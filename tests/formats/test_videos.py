@@ -1,0 +1,135 @@
+"""A folder of videos: what is found in it, which column is what, and what is refused by name."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from acwm_core.errors import DataError
+from acwm_formats.videos import Videos
+from tests.formats.corpus import tables
+from tests.formats.corpus.cases import episode
+from tests.formats.corpus.clips import Clip, write_clip, write_images
+from tests.formats.corpus.pictures import number_in
+
+
+def film(path, first, clip=None):
+    """Write eight frames; returns what they show and the rows that belong to them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shown = episode(first)
+    write_clip(path, shown.numbers, shown.times, 10, clip or Clip())
+    return shown
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def first_number(recording, camera):
+    (frame,) = recording.cameras[camera].read([0])
+    return number_in(frame)
+
+
+def test_a_folder_per_episode_with_several_cameras(tmp_path):
+    for place in (0, 1):
+        shown = film(tmp_path / f"run {place}" / "top.mp4", 40 * place)
+        film(tmp_path / f"run {place}" / "wrist.mp4", 40 * place + 20)
+        write_images(tmp_path / f"run {place}" / "side", shown.numbers, "png")
+        tables.write_csv(tmp_path / f"run {place}" / "log.csv", shown, "time")
+    found = Videos().read(tmp_path)
+    second = found.splits[1]
+    assert second.name == "run 1"
+    assert [*second.cameras] == ["side", "top", "wrist"]
+    assert [first_number(second, name) for name in second.cameras] == [40, 40, 60]
+    assert Videos.detect(tmp_path)
+
+
+def test_columns_by_name(tmp_path):
+    film(tmp_path / "a.mp4", 0)
+    lines = [f"{k / 10},{k},{-k},x,{k % 2}" for k in range(8)]
+    write(tmp_path / "a.csv", "\n".join(["time,push,turn,label,seen", *lines]))
+    found = Videos().read(tmp_path, columns="turn", states="seen")
+    recording = found.splits[0]
+    np.testing.assert_array_equal(recording.actions.values[:, 0], -np.arange(8))
+    np.testing.assert_allclose(recording.actions.times, np.arange(8) / 10)
+    np.testing.assert_array_equal(recording.states["seen"].values[:, 0], np.arange(8) % 2)
+    assert any("push, label" in note for note in found.notes)
+    assert found.actions.names == ("turn",)
+    assert recording.rate == 10
+
+
+def test_what_is_called_action_is_one(tmp_path):
+    film(tmp_path / "a.mp4", 0)
+    np.savez(tmp_path / "a.npz", action=np.ones((8, 3)), reward=np.zeros(8))
+    assert Videos().read(tmp_path).actions.names == ("action_0", "action_1", "action_2")
+
+
+@pytest.mark.parametrize("named", ["a", "a.mp4", 0], ids=["stem", "file", "number"])
+def test_one_table_for_all(tmp_path, named):
+    film(tmp_path / "a.mp4", 0)
+    film(tmp_path / "b.mp4", 20)
+    other = 1 if named == 0 else str(named).replace("a", "b")
+    rows = [f"{who},{k}" for who in (other, named) for k in range(8)]
+    write(tmp_path / "all.csv", "\n".join(["video,push", *rows]))
+    recording = Videos().read(tmp_path).splits[0]
+    np.testing.assert_array_equal(recording.actions.values[:, 0], np.arange(8))
+
+
+def test_nanoseconds_keep_their_precision(tmp_path):
+    film(tmp_path / "a.mp4", 0)
+    start = 1_700_000_000_123_456_789
+    rows = [f"{start + k * 100_000_000},{k}" for k in range(8)]
+    write(tmp_path / "a.csv", "\n".join(["stamp_ns,push", *rows]))
+    recording = Videos().read(tmp_path, from_first_row=True).splits[0]
+    np.testing.assert_allclose(recording.actions.times, np.arange(8) / 10, atol=1e-6)
+
+
+CSV = "time,push\n0,1\n0.1,2\n"
+REFUSED = {
+    "no table": ({"a.mp4": None}, {}, "has no table of actions beside a"),
+    "no video": ({"a.csv": CSV}, {}, "holds no video"),
+    "an unknown column": ({"a.mp4": None, "a.csv": CSV}, {"columns": "pusch"}, "mean 'push'"),
+    "no action": ({"a.mp4": None, "a.csv": "time\n0\n"}, {}, "no column of actions"),
+    "a decimal comma": ({"a.mp4": None, "a.csv": "push;turn\n1,5;2\n"}, {}, "holds '1,5'"),
+    "no row": ({"a.mp4": None, "a.csv": "push\n"}, {}, "holds no row"),
+    "several tables": (
+        {"a.mp4": None, "x.csv": CSV, "y.csv": CSV},
+        {},
+        "several tables .x.csv, y.csv.: give --actions",
+    ),
+    "other episodes": (
+        {"a.mp4": None, "all.csv": "episode,push\nb,1\n"},
+        {},
+        "no row of a in the column episode",
+    ),
+    "a number too many": (
+        {"a.mp4": None, "all.csv": "episode,push\n0,1\n1,1\n"},
+        {},
+        "numbers 2 episodes from 0 to 1, and there are 1 videos",
+    ),
+}
+
+
+@pytest.mark.parametrize(("files", "options", "problem"), REFUSED.values(), ids=REFUSED)
+def test_what_is_refused(tmp_path, files, options, problem):
+    for name, text in files.items():
+        film(tmp_path / name, 0) if text is None else write(tmp_path / name, text)
+    with pytest.raises(DataError, match=problem):
+        Videos().read(tmp_path, **options).splits[0]
+
+
+def test_pictures_need_a_rate(tmp_path):
+    write_images(tmp_path / "a", range(8), "png")
+    write(tmp_path / "a.csv", "\n".join(["push", *map(str, range(8))]))
+    with pytest.raises(DataError, match="8 pictures: give --rate"):
+        Videos().read(tmp_path).splits[0]
+    times = Videos().read(tmp_path, rate=29.97).splits[0].cameras["video"].times
+    np.testing.assert_allclose(times, np.arange(8) / float(Fraction(30000, 1001)))
+
+
+def test_a_lone_table_is_told(tmp_path):
+    film(tmp_path / "a.mp4", 0)
+    write(tmp_path / "a.csv", CSV)
+    write(tmp_path / "b.csv", CSV)
+    assert "Tables without a video: b.csv." in Videos().read(tmp_path).notes
