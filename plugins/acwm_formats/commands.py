@@ -137,10 +137,16 @@ class FormatGroup(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put the format first: the one of ``--format``, or the one that the path is in."""
-        name, rest = _chosen_format(args)
+        name, rest = _chosen_format([self._local(word) for word in args])
         if name is None and rest and not rest[0].startswith("-") and rest[0] not in _formats():
             name = self._found(rest[0])
         return super().parse_args(ctx, [name, *rest] if name else rest)
+
+    def _local(self, word: str) -> str:
+        """Fetch what a URL stands for; other words stay."""
+        from acwm_formats.sources import fetched, is_url
+
+        return str(fetched(word)) if self._method == "read" and is_url(word) else word
 
     def _found(self, path: str) -> str:
         from acwm_formats.format import detected_format

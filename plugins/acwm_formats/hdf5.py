@@ -157,7 +157,7 @@ def _paths(text: str | None) -> dict[str, str]:
 def _splits(
     files: Sequence[Path],
     layout: Layout,
-    reader: Callable[[Sequence[tuple[Path, str]]], Recordings],
+    reader: Callable[[dict[int, tuple[Path, str]]], Recordings],
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
     found: dict[Split | None, list[tuple[Path, str]]] = {}
@@ -174,8 +174,8 @@ def _splits(
         what = " and ".join((layout.actions, *layout.cameras.values()))
         raise DataError(f"{files[0]} has no group with {what}")
     if None in found:
-        return reader([place for places in found.values() for place in places])
-    return {split: reader(places) for split, places in found.items() if split}
+        return reader(dict(enumerate(place for places in found.values() for place in places)))
+    return {split: reader(dict(enumerate(places))) for split, places in found.items() if split}
 
 
 def _tests(file: Any) -> dict[str, Split] | None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ class HDF5Recordings:
         pixel_range: values that are black and white, see `images.to_rgb`.
     """
 
-    places: Sequence[tuple[Path, str]]
+    places: Mapping[int, tuple[Path, str]]
     layout: Layout
     rate: Fraction
     pixel_range: tuple[float, float] | None = None
@@ -37,6 +37,10 @@ class HDF5Recordings:
     def __len__(self) -> int:
         """The number of episodes."""
         return len(self.places)
+
+    def part(self, indices: Sequence[int]) -> HDF5Recordings:
+        """The same, with the places of some episodes."""
+        return replace(self, places={index: self.places[index] for index in indices})
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""

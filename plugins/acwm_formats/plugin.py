@@ -44,6 +44,11 @@ def register_formats(registry: Registry) -> None:
         extra="hdf5",
         requires=("h5py",),
     )
+
+
+@hookimpl(specname="register_formats")
+def register_formats_of_arrays(registry: Registry) -> None:
+    """Add formats that need a library of their own."""
     registry.add(
         "zarr",
         "acwm_formats.zarr_replay:ZarrReplay",

@@ -21,7 +21,7 @@ from acwm_core.errors import AcwmError, DataError
 from acwm_core.plugins import catalog
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
-from acwm_formats.frames import VideoFrames
+from acwm_formats.frames import VideoFrames, video_index
 from acwm_formats.published_layout import (
     CITATION,
     ENVIRONMENTS,
@@ -162,7 +162,9 @@ class PublishedRecordings:
         entry = _entries(self.folder / METADATA)[index]
         frames = VideoFrames(self.folder / entry.video)
         name = f"{self.folder.name}/{entry.video}"
-        return TimedRecording(name, {"video": frames}, Samples(entry.actions), length=entry.length)
+        rate = video_index(frames.path).rate
+        actions = Samples(entry.actions)
+        return TimedRecording(name, {"video": frames}, actions, rate=rate, length=entry.length)
 
 
 def _folders(root: Path) -> list[Path]:

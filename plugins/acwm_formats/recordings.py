@@ -410,7 +410,8 @@ def _picked(recordings: Recordings, places: Sequence[int]) -> Recordings:
     """What is sent to a worker: of a list only the recordings that it needs."""
     if isinstance(recordings, list | tuple):
         return cast(Recordings, {index: cast(Any, recordings)[index] for index in places})
-    return recordings
+    part = getattr(recordings, "part", None)
+    return part(places) if part else recordings
 
 
 def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:

@@ -151,8 +151,9 @@ class Recording:
 class Recordings(Protocol):
     """Recordings by index, from 0: a list, or an object that opens them on request.
 
-    To be sent to workers, it must be picklable, importable and small. An error of ``__getitem__``
-    (a `DataError` or an `OSError`) counts as a defect of that recording.
+    To be sent to workers, it must be picklable, importable and small; one that knows a long list
+    may have a method ``part(indices)``, which returns the same with what those recordings need. An
+    error of ``__getitem__`` (a `DataError` or an `OSError`) counts as a defect of that recording.
     """
 
     def __len__(self) -> int:

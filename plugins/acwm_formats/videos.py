@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,7 +125,9 @@ class Videos(Format):
         options |= {"rate": rate, "from_first_row": from_first_row}
         return RecordedDataset(
             name=word(root),
-            splits=VideoFolder(root, actions, digest(places), table, chosen, rate, from_first_row),
+            splits=VideoFolder(
+                dict(enumerate(places)), len(places), table, chosen, rate, from_first_row
+            ),
             facts={"kind": "videos", "name": root.resolve().name, **_facts(places, table)},
             options=options,
             actions=ActionFacts(chosen.actions),
@@ -146,31 +147,28 @@ class VideoFolder:
     """The episodes of a folder, opened on request.
 
     Attributes:
-        root: the folder.
-        actions: name of a table, as in `find_places`.
-        found: `digest` of what was found.
+        places: where each episode lies.
+        count: number of episodes in the folder.
         table: the table for all, if there is one.
         columns: what the columns of tables are.
         rate: frames per second of pictures.
         from_first_row: whether the first row was taken with the first frame.
     """
 
-    root: Path
-    actions: str | None
-    found: str
+    places: Mapping[int, Place]
+    count: int
     table: Path | None
     columns: Columns
     rate: float | None
     from_first_row: bool
 
-    @property
-    def places(self) -> list[Place]:
-        """Where the episodes lie; each process looks for itself, as the list is long."""
-        return _places(self.root, self.actions, self.found)
-
     def __len__(self) -> int:
         """The number of episodes."""
-        return len(self.places)
+        return self.count
+
+    def part(self, indices: Sequence[int]) -> VideoFolder:
+        """The same, with the places of some episodes."""
+        return replace(self, places={index: self.places[index] for index in indices})
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
@@ -180,7 +178,8 @@ class VideoFolder:
             raise DataError(f"there is no table of actions beside {place.name}")
         rows = _read_once(path, file_stamp(path)) if self.table else read_table(path)
         if self.table and self.columns.episode:
-            rows = _rows_of(rows, self.columns.episode, index, self.places, path)
+            column = self.columns.episode
+            rows = _rows_of(rows, column, index, place, self.count, path)
         times = None
         if self.columns.time:
             times = seconds(rows, self.columns.time, path)
@@ -263,19 +262,6 @@ def _folder(root: Path, folder: Path, actions: str | None) -> list[Place]:
     return [Place(folder.name, cameras, table)]
 
 
-@functools.lru_cache(maxsize=2)
-def _places(root: Path, actions: str | None, found: str) -> list[Place]:
-    places = find_places(root, actions)
-    if digest(places) != found:
-        raise DataError(f"files in {root} came or went during the import: start it again")
-    return places
-
-
-def digest(places: Sequence[Place]) -> str:
-    """What changes when episodes come, go or are called otherwise."""
-    return hashlib.sha256(repr(places).encode()).hexdigest()
-
-
 def _order(path: Path) -> list[tuple[int, str]]:
     return natural(path.name)
 
@@ -312,24 +298,23 @@ def _read_once(path: Path, _: str) -> Table:
     return read_table(path)
 
 
-def _rows_of(table: Table, column: str, index: int, places: Sequence[Place], path: Path) -> Table:
+def _rows_of(table: Table, column: str, index: int, place: Place, count: int, path: Path) -> Table:
     """The rows of one episode, named by its video or by its place in natural order."""
     values = table[column]
     if values.dtype.kind in "iuf":
         known = np.unique(values)
-        if not np.array_equal(known, np.arange(len(places))):
+        if not np.array_equal(known, np.arange(count)):
             raise DataError(
                 f"the column {column} of {path} numbers {len(known)} episodes from {known[0]:g} to "
-                f"{known[-1]:g}, and there are {len(places)} videos: number them from 0, or use "
+                f"{known[-1]:g}, and there are {count} videos: number them from 0, or use "
                 "names"
             )
         chosen = values == index
     else:
-        place = places[index]
         files = {place.name, *(source.name for source in place.cameras.values())}
         chosen = np.array([str(value) in files for value in values])
     if not chosen.any():
-        raise DataError(f"{path} has no row of {places[index].name} in the column {column}")
+        raise DataError(f"{path} has no row of {place.name} in the column {column}")
     return {name: rows[chosen] for name, rows in table.items()}
 
 
