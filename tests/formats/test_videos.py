@@ -1,10 +1,17 @@
 """A folder of videos: what is found in it, which column is what, and what is refused by name."""
 
+import pickle
 from fractions import Fraction
 
+import fsspec
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from acwm_core.cli import main
+from acwm_core.data import remote
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats.videos import Videos
 from tests.formats.corpus import tables
@@ -43,6 +50,36 @@ def test_a_folder_per_episode_with_several_cameras(tmp_path):
     assert [*second.cameras] == ["side", "top", "wrist"]
     assert [first_number(second, name) for name in second.cameras] == [40, 40, 60]
     assert Videos.detect(tmp_path)
+
+
+def test_two_cameras_behind_a_url_become_one_wide_frame(tmp_path, monkeypatch):
+    monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
+    for place in (0, 1):
+        shown = film(tmp_path / f"runs/run {place}/top.mp4", 40 * place)
+        film(tmp_path / f"runs/run {place}/wrist.mp4", 40 * place + 20)
+        tables.write_csv(tmp_path / f"runs/run {place}/log.csv", shown, "time")
+    memory = fsspec.filesystem("memory")
+    memory.put(str(tmp_path / "runs"), "/runs", recursive=True)
+    words = ["data", "import", "memory://runs", "--camera", "wrist", "--camera", "top"]
+    words += ["--out", str(tmp_path / "out"), "--workers", "0", "--test-episodes", "0"]
+    done = CliRunner().invoke(main, words)
+    memory.rm("/runs", recursive=True)
+    assert done.exit_code == 0, done.output
+    assert "is in the format videos" in done.output
+    assert DatasetCard.read(tmp_path / "out").environment.views == ("wrist", "top")
+    frame = EpisodeDataset(tmp_path / "out", "train")[1].video[3]
+    left, right = np.split(frame, 2, axis=1)
+    assert (number_in(left), number_in(right)) == (63, 43)
+
+
+def test_a_worker_gets_what_its_recordings_need(tmp_path):
+    for name in "abc":
+        film(tmp_path / f"{name}.mp4", 0)
+        write(tmp_path / f"{name}.csv", CSV)
+    part = pickle.loads(pickle.dumps(Videos().read(tmp_path).splits.part([1])))
+    assert (len(part), part[1].name) == (3, "b")
+    with pytest.raises(KeyError):
+        part[0]
 
 
 def test_columns_by_name(tmp_path):
