@@ -53,7 +53,6 @@ class EnvironmentChecks(TaskChecks):
         expect(self.name in (None, card.name), f"its card calls it {card.name!r}")
         for attribute in ("name", "summary", "engine", "state"):
             expect(getattr(card, attribute), f"the card's {attribute} is empty")
-        expect(card.fps > 0, f"{card.fps} frames per second")
         expect(card.horizon >= 2, f"a horizon of {card.horizon} frames leaves no action to take")
         expect(action.size > 0, "the action has no dimension")
         expect(card.instances[1:], "the card names nothing but the background in `instances`")
