@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -16,7 +17,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
-from acwm_core.errors import DataError, RecipeError, noting, suggest
+from acwm_core.errors import AcwmWarning, DataError, RecipeError, noting, suggest
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
@@ -43,7 +44,8 @@ class DreamSettings:
     Attributes:
         run: run folder, or name of a trained model.
         task: task of its environment; without one, rewards are 0 and no episode ends early.
-        start: source of starts: the ``simulator`` or a ``dataset``.
+        start: source of starts: the ``simulator`` or a ``dataset``; if there is no simulator, the
+            dataset, with an `AcwmWarning`.
         data: folder of the dataset; that of the run's recipe by default.
         split: split of the dataset.
         max_steps: video frames per episode; the task's own number of actions by default.
@@ -162,7 +164,10 @@ class Dreams:
 
     def _make_starts(self, path: str | None) -> Starts:
         if self._settings.start == "simulator":
-            return SimulatorStarts(self.card, self._given, self.task)
+            if self.card.name in catalog().registry("environment"):
+                return SimulatorStarts(self.card, self._given, self.task)
+            text = f"{self.card.name} has no simulator here: episodes begin like those of its data"
+            warnings.warn(text, AcwmWarning, stacklevel=2)
         folder = self._settings.data or path
         if folder is None:
             raise DataError("there is no dataset to start from: name one with data=")

@@ -42,6 +42,7 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
     """Play with the model of RUN beside the simulator, in a browser.
 
     Both start from the same frame and get your actions, by keyboard, mouse, touch or gamepad.
+    Beside a model of recorded data is the recorded video, which goes its own way.
     Several runs make a menu; without RUN, it shows the installed trained models. Only this machine
     can open the page. Ctrl-C ends it.
     """
@@ -55,6 +56,10 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
     if folder and len(runs) != 1:
         raise RecipeError("--export writes the page of one run: name one")
     worlds = playable(runs, **options)
+    if worlds[0].data:
+        click.echo(f"left out: {worlds[0].environment} is recorded, so no simulator follows you")
+    if folder and worlds[0].data:
+        raise RecipeError(f"--export needs a simulator, and {worlds[0].environment} is recorded")
     if folder:
         from acwm_play.export.page import export
 

@@ -35,6 +35,8 @@ TOLERANCE = 1e-3
 
 def physics_of(environment: str) -> Physics | None:
     """The physics of a world, which says what can be measured; None if it has none."""
+    if environment not in catalog().registry("environment"):  # it is recorded
+        return None
     component = catalog().component("environment", environment)
     if component.physics is None:
         return None

@@ -17,6 +17,7 @@ from acwm_play.figures import Instruments
 from acwm_play.layout import controls, physics_of
 from acwm_play.live_model import LiveModel
 from acwm_play.process import SimulatorProcess
+from acwm_play.recorded import RecordedVideo
 from acwm_play.simulator import Scene, TimeStep
 from acwm_play.workers import Workers
 from acwm_play.worlds import World, tasks_of
@@ -40,22 +41,33 @@ class LiveWorld:
         scene: the scene that was started last.
         recent: the simulator's last time steps in this scene, at most `MEMORY` or as many as the
             model starts from.
+        apart: whether the model got other actions than a recorded video beside it since both showed
+            the same, so that they cannot be compared.
     """
 
     world: World
     workers: Workers
-    simulator: SimulatorProcess
+    simulator: SimulatorProcess | RecordedVideo
     model: LiveModel
     instruments: Instruments
     controls: list[dict[str, Any]]
     tasks: dict[str, Task]
     scene: Scene
     recent: deque[TimeStep]
+    apart: bool = False
+
+    @property
+    def recorded(self) -> bool:
+        """Whether a recorded video stands in for the simulator."""
+        return self.world.data is not None
 
     @classmethod
     async def create(cls, world: World, workers: Workers) -> LiveWorld:
         """Load everything that a world needs."""
-        simulator = await SimulatorProcess.launch(world.environment, world.size)
+        if world.data is None:
+            simulator = await SimulatorProcess.launch(world.environment, world.size)
+        else:
+            simulator = RecordedVideo(world.data, world.size)
         card = simulator.card
         try:
             model = await workers.run("model", workers.live_model, world, card)
@@ -78,6 +90,7 @@ class LiveWorld:
 
     async def take_over(self) -> NDArray[np.uint8]:
         """Restart the model from the simulator's last frames; returns its picture of the last."""
+        self.apart = False
         given = [*self.recent][-self.model.given :]
         frames = np.stack([time_step.frame for time_step in given])
         actions = [time_step.action for time_step in given][1:]
@@ -85,6 +98,7 @@ class LiveWorld:
 
     async def act(self, action: NDArray[np.float32]) -> TimeStep:
         """Advance the simulator by one frame."""
+        self.apart = self.recorded
         self.recent.append(await self.simulator.step(action))
         return self.recent[-1]
 
@@ -118,12 +132,13 @@ class LiveWorld:
         )
         return {
             **shared,
+            "recorded": self.recorded,
             "drivers": _describe_drivers() if self.tasks else [],
             "tasks": [_describe_task(name, task) for name, task in self.tasks.items()],
             "metrics": self.instruments.about,
             "why_not": self.instruments.why_not,
             "factors": [dataclasses.asdict(factor) for factor in card.factors],
-            "index": self.scene.index,
+            "index": self.scene.index % self.simulator.scenes,
             "asked": dict(self.scene.factors),
             "drawn": dict(time_step.factors),
             "ood": label.split("+") if label else [],

@@ -16,7 +16,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal
 from acwm_core.errors import PluginError, RecipeError, sentence
 from acwm_play.layout import Pointing, physics_of
-from acwm_play.simulator import Scene, Simulator, TaskProgress, TimeStep
+from acwm_play.simulator import SCENES, Scene, Simulator, TaskProgress, TimeStep
 
 PATIENCE = 5.0
 """Seconds to wait for a process to end before it is killed."""
@@ -33,6 +33,7 @@ class SimulatorProcess:
         alive: whether the process still answers.
     """
 
+    scenes = SCENES
     card: EnvironmentCard
     pointing: Pointing | None
 

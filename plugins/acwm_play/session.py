@@ -252,7 +252,7 @@ class Session:
             "seqs": seqs,
             "alone": self._alone / live.simulator.card.fps,
             "pace": self._pace,
-            "pixel_error": pixel_error(frames[-1], time_steps[-1].frame),
+            "pixel_error": None if live.apart else pixel_error(frames[-1], time_steps[-1].frame),
             "spread": live.model.spread,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
@@ -282,7 +282,12 @@ class Session:
 
     async def _follow_recording(self) -> None:
         """Start or end a recording, between latent frames."""
-        if self._keep_recording and self._recording is None and self._last is not None:
+        if self._live is not None and self._live.recorded:
+            self._keep_recording = False
+            text = "Nothing is saved: the video beside the model is a recording, and is not yours"
+            self._tell("notice", text=text, wrong=True)
+            self._tell_state()
+        elif self._keep_recording and self._recording is None and self._last is not None:
             self._recording = Recording([self._last[0]], [self._last[1]])
         elif not self._keep_recording:
             await self._save()

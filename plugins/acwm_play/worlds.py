@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acwm_core.data.card import DatasetCard
+from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.env.task import Task
 from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.plugins import catalog
+from acwm_core.recipe import Recipe
 from acwm_core.training.run_folder import RunFolder, find_run, trained_models
 
 
@@ -23,14 +24,16 @@ class World:
     Attributes:
         name: name of the run, unique in the menu.
         run: folder of the run, or name of a trained model.
-        environment: registered name of the simulator.
+        environment: registered name of the simulator; of recorded data just a name.
         size: height and width of frames.
+        data: data folder whose video is shown instead, if there is no simulator.
     """
 
     name: str
     run: str | Path
     environment: str
     size: tuple[int, int]
+    data: Path | None = None
 
 
 def playable(
@@ -41,6 +44,8 @@ def playable(
 ) -> list[World]:
     """The given runs and the installed trained models; the first one is played first.
 
+    A run without a simulator is played beside the recorded video of its data.
+
     Args:
         runs: run folders.
         environment: environment for the given runs, or, without runs, of the trained model that
@@ -50,7 +55,7 @@ def playable(
     Raises:
         RecipeError: there is no such environment.
         TrainingError: there is nothing to play; the message says what to do.
-        RecipeError: the simulator of a run's environment is not installed.
+        RecipeError: a run has neither the simulator of its environment nor its data.
     """
     if environment:
         _ = catalog().component("environment", environment)
@@ -66,12 +71,9 @@ def playable(
             f"no trained model {what}is installed: train one, as `acwm demo` does, and name its "
             "run, as in `acwm play runs/demo/run`"
         )
-    for world in given:
-        if world.environment not in simulators:
-            raise RecipeError(
-                f"no simulator of {world.environment}, the world of {world.run}, is installed: "
-                "choose another with --env"
-            )
+    worlds = [
+        world if world.environment in simulators else _beside_recording(world) for world in worlds
+    ]
     return [
         dataclasses.replace(world, name=name) for name, world in _by_unique_name(worlds).items()
     ]
@@ -79,12 +81,25 @@ def playable(
 
 def tasks_of(environment: str) -> dict[str, Task]:
     """The tasks of a world by name, without those that cannot be loaded."""
+    if environment not in catalog().registry("environment"):  # it is recorded
+        return {}
     component = catalog().component("environment", environment)
     tasks: dict[str, Any] = {}
     for name in component.tasks:
         with contextlib.suppress(Exception):  # whatever a plugin raises
             tasks[name] = component.load_task(name)
     return {name: task for name, task in tasks.items() if isinstance(task, Task)}
+
+
+def _beside_recording(world: World) -> World:
+    data = Path(str(Recipe.from_yaml(RunFolder(Path(world.run)).recipe).data["path"]))
+    if not (data / CARD).exists():
+        raise RecipeError(
+            f"no simulator of {world.environment}, the world of {world.run}, is installed, and "
+            f"there is no dataset in {data} whose video could be shown: choose another world with "
+            "--env"
+        )
+    return dataclasses.replace(world, data=data)
 
 
 def _world(

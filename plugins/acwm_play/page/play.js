@@ -181,7 +181,7 @@ function play(now) {
 function headline(head) {
   $("alone-text").textContent = `${head.alone.toFixed(1)} s`;
   if (head.places && state.driver !== "you") rings(places = head.places);
-  tile("alone", "On its own", `${head.alone.toFixed(1)} s`, "since it saw the simulator");
+  tile("alone", "On its own", `${head.alone.toFixed(1)} s`, `since it saw the ${world.recorded ? "recording" : "simulator"}`);
   const error = head.pixel_error === null ? null : head.pixel_error * 100; // null: nothing is beside it
   note("pixel_error", head.alone, error);
   tile("pixel_error", "Pixel error", error === null ? "–" : `${error.toFixed(1)} %`, "root mean square");
@@ -302,7 +302,9 @@ function enter(about) {
     dials(about);
   }
   document.title = `${about.environment} · acwm play`;
-  $("engine").textContent = about.engine;
+  document.querySelector(".sim figcaption b").textContent = about.recorded ? "Recording" : "Simulator";
+  document.querySelector("input[value=policy] + span .served-only").textContent = about.recorded ? "Recording" : "Policy";
+  $("engine").textContent = about.recorded ? "" : about.engine;
   $("summary").textContent = about.summary;
   badges(about);
   forgetGoal();
