@@ -244,6 +244,11 @@ def import_format(
     options = import_options(**asked)
     found = source.read(**given)
     several = {".": found} if isinstance(found, RecordedDataset) else found
+    if options.environment and len(several) > 1:
+        raise DataError(
+            f"--environment {options.environment} would name {len(several)} datasets alike: import "
+            "one folder at a time, or leave it out"
+        )
     for name, recorded in several.items():
         card = import_dataset(recorded, out / name, options, workers=workers)
         made = ", ".join(f"{count} {split}" for split, count in card.splits.items())

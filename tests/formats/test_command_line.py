@@ -42,6 +42,16 @@ def imported(tmp_path_factory):
     return folder / "push_cube"
 
 
+def test_one_name_is_not_given_to_several_environments(tmp_path):
+    for place in ("push_block", "reacher"):
+        release.environment(tmp_path / "release" / place, splits={"ind_test": 1}, length=3)
+    words = ["acwm-phys", tmp_path / "release", "--out", tmp_path / "data", "--environment", "mine"]
+    result = CliRunner().invoke(main, ["data", "import", *map(str, words)])
+    assert result.exit_code == 2
+    assert "mine" in result.stderr
+    assert not (tmp_path / "data").exists()
+
+
 def test_info_check_and_preview_know_it(imported, tmp_path):
     said = run("data", "info", imported)
     assert "recorded: push_block (acwm-phys)" in said
