@@ -13,7 +13,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 
 LENGTH = 64  # frames of a stretch, at most
-MOST, LEAST = 192, 24  # stretches
+MOST, LEAST = 128, 24  # stretches
 PIXELS = 400e6  # of all stretches together; larger frames give fewer stretches
 GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples spread evenly, however many there are
 

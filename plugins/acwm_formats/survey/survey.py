@@ -182,16 +182,17 @@ def _of_actions(found: Survey) -> Iterator[Finding]:
 
 def _of_frames(found: Survey) -> Iterator[Finding]:
     facts = found.frames
-    if not any(getattr(facts, name) for name in PHRASES):
+    asked = PHRASES if found.card.source else PHRASES.keys() - {"repeated", "frozen"}
+    counts = {name: getattr(facts, name) for name in PHRASES if name in asked}
+    if not any(counts.values()):
         yield Finding("good", f"{facts.frames:,} frames were looked at; none is defective")
-    for name, phrase in PHRASES.items():
-        count = getattr(facts, name)
+    for name, count in counts.items():
         if not count:
             continue
         split, episode, frame = facts.examples[name][0]
         where = f"e.g. frame {frame} of {split} {episode}"
         level = "bad" if count > 0.05 * facts.frames else "note"
-        yield Finding(level, f"{count} of {facts.frames:,} frames are {phrase} ({where})")
+        yield Finding(level, f"{count} of {facts.frames:,} frames are {PHRASES[name]} ({where})")
 
 
 def _of_twins(found: Survey) -> Iterator[Finding]:
