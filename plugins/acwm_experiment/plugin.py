@@ -10,5 +10,5 @@ def register_commands(registry: Registry) -> None:
         "experiment",
         "acwm_experiment.commands:experiment",
         summary="simulate, train, evaluate, plan with and report many runs",
-        after="rollout",
+        after="play",
     )

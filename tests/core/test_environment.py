@@ -71,7 +71,7 @@ def test_vector_environments_hold_what_differs_between_their_members():
 
 def test_an_action_of_an_unknown_kind_is_refused():
     """Else a dataset would be written that nobody can read."""
-    with pytest.raises(ShapeError, match="absolute, delta, torque, not 'force'"):
+    with pytest.raises(ShapeError, match="absolute, delta, velocity, torque, not 'force'"):
         ActionSpec(("x",), ("N",), (-1.0,), (1.0,), "force")
 
 

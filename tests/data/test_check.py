@@ -66,7 +66,7 @@ def test_a_shard_that_was_exchanged_together_with_its_record_is_found(data):
     [
         (
             lambda a: a + np.float32(100) * (np.arange(len(a)) < 3)[:, None].astype(np.float32),
-            "out of bounds",
+            "out of its bounds",
         ),
         (lambda a: np.where(np.arange(len(a))[:, None] == 2, np.float32("nan"), a), "not finite"),
         (lambda a: a[:, :1], "actions are"),

@@ -47,7 +47,7 @@ def desk(tmp_path, monkeypatch):
 def test_every_step_works(desk):
     text = PAGE.read_text()
     commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)
-    assert len(commands) == 16
+    assert len(commands) == 17
     for line in commands:
         words = shlex.split(line)
         words += QUICK if words[0] == "fit" else ()

@@ -10,6 +10,7 @@ from torch.nn import functional
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Predictor
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import DECODED_TOGETHER, WorldModel
 from acwm_core.plugins import catalog
@@ -116,7 +117,7 @@ def drifting(batch, seed):
     generator = torch.Generator().manual_seed(seed)
     start, speed = torch.randn(2, batch, 1, 1, 1, 1, generator=generator)
     latents = (start + speed * torch.arange(6.0)[:, None, None, None]).expand(-1, -1, 1, 4, 4)
-    return latents, Conditioning(torch.zeros(batch, 6, 16), None, None)
+    return Batch(latents, Conditioning(torch.zeros(batch, 6, 16), None, None), [])
 
 
 def test_several_given_frames_show_velocities():
@@ -128,10 +129,10 @@ def test_several_given_frames_show_velocities():
         optimizer = torch.optim.AdamW(model.parameters(), 1e-2)
         for step in range(200):
             optimizer.zero_grad()
-            Regression().loss(model, *drifting(32, step), [], known).backward()
+            Regression().loss(model, drifting(32, step), known).backward()
             optimizer.step()
         with torch.no_grad():
-            errors[known] = Regression().loss(model, *drifting(256, 10_000), [], known).item()
+            errors[known] = Regression().loss(model, drifting(256, 10_000), known).item()
     assert errors[1] > 8
     assert errors[2] < 1
 
