@@ -2,8 +2,6 @@
 
 from collections.abc import Iterable
 
-import pytest
-
 from acwm_core.checks import CheckResult
 from acwm_core.checks.result import checks_of
 from acwm_core.plugins import Component, catalog
@@ -36,16 +34,6 @@ def installed(kind) -> list[Component]:
         component
         for component in components
         if component.distribution and not component.missing_modules()
-    ]
-
-
-def with_variants_slow(kind):
-    """Parameters for a test: those installed; variants of a simulator, of its module, are slow."""
-    modules = {part.name: part.target.partition(":")[0] for part in installed("environment")}
-    first = {module: name for name, module in reversed(modules.items())}.values()
-    return [
-        pytest.param(part, id=part.name, marks=[] if part.name in first else pytest.mark.slow)
-        for part in installed(kind)
     ]
 
 

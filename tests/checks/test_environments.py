@@ -18,10 +18,23 @@ from acwm_core.env.environment import Environment
 from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
 from tests.checks.flawed import FLAWS
-from tests.checks.results import failures, in_words, only_run, with_variants_slow
+from tests.checks.results import failures, in_words, installed, only_run
 from tests.episodes import assert_same
 
 CHECKS = checks_of(EnvironmentChecks)
+
+
+QUICK = ("push_rope", "reacher")
+"""Worlds that `make test` checks; `.ci/run` checks all, and only their variants are slow."""
+
+
+def worlds():
+    """Parameters for a test: the installed environments, one for each module of a simulator."""
+    modules = {part.name: part.target.partition(":")[0] for part in installed("environment")}
+    first = {module: name for name, module in reversed(modules.items())}.values()
+    for part in installed("environment"):
+        marks = pytest.mark.shipped if part.name in first else pytest.mark.slow
+        yield pytest.param(part, id=part.name, marks=[] if part.name in QUICK else marks)
 
 
 def with_two_threads(make):
@@ -34,7 +47,7 @@ def with_two_threads(make):
     return make()
 
 
-@pytest.mark.parametrize("part", with_variants_slow("environment"))
+@pytest.mark.parametrize("part", worlds())
 def test_installed_environments_conform(part, monkeypatch, tmp_path):
     """With two threads in its fresh process, and with its estimator; a shard keeps its episode."""
     for library in ("OMP", "OPENBLAS"):

@@ -1,10 +1,9 @@
 """The published layout: what comes in, and what is said of it."""
 
+import itertools
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +18,9 @@ from acwm_formats import staging
 from acwm_formats.check import check_dataset
 from acwm_formats.published import Published
 from acwm_formats.published_layout import read_entries
-from tests.folders import wait_until
 from tests.formats import release
 from tests.formats.conftest import checksums, psnr
 from tests.formats.conftest import load_published as load
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_episodes_come_in_as_they_are(published, tmp_path):
@@ -188,17 +184,22 @@ class Counted:
 
 
 def test_a_killed_import_resumes_where_it_was(published, tmp_path, monkeypatch):
-    code = (
-        "import sys; from tests.formats.test_published import load\n"
-        "load(sys.argv[1], sys.argv[2], workers=2, shard_episodes=1)"
-    )
-    out = tmp_path / "killed"
-    command = [sys.executable, "-c", code, str(published[0]), str(out)]
-    running = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
-    wait_until(lambda: list(out.glob(".importing/*.zip")), running)
-    os.killpg(running.pid, signal.SIGKILL)
-    running.wait()
-    monkeypatch.setattr(staging, "encode_frames", counted := Counted(staging.encode_frames))
+    out, encode = tmp_path / "killed", staging.encode_frames
+    calls = itertools.count()
+
+    def dying(*given):
+        if next(calls) == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return encode(*given)
+
+    monkeypatch.setattr(staging, "encode_frames", dying)
+    fork = multiprocessing.get_context("fork")
+    running = fork.Process(target=load, args=(published[0], out), kwargs={"shard_episodes": 1})
+    running.start()
+    running.join()
+    assert running.exitcode == -signal.SIGKILL
+    assert list(out.glob(".importing/*.zip"))
+    monkeypatch.setattr(staging, "encode_frames", counted := Counted(encode))
     load(published[0], out, shard_episodes=1)
     assert counted.calls < 2 * 9  # a video and its masks for each episode that was not there
     assert not (out / ".importing").exists()
