@@ -8,7 +8,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 # Tests also wait, for servers, browsers and processes; so one process more than there are cores.
 TEST_PROCESSES ?= $(shell expr $$(nproc 2>/dev/null || sysctl -n hw.ncpu) + 1)
 PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
-SELECT ?= not slow and not gpu and not browser and not shipped
+SELECT ?= not slow and not gpu and not browser and not ci
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-all lint format types lowest docs site codec-weights build clean

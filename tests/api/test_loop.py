@@ -79,7 +79,7 @@ def test_planners_tasks_and_environments_by_name():
             make("nonsuch")
 
 
-@pytest.mark.shipped
+@pytest.mark.ci
 def test_the_page_runs_as_it_is_written(tmp_path):
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
     assert len(blocks[0].splitlines()) < 30

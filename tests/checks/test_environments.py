@@ -33,7 +33,7 @@ def worlds():
     modules = {part.name: part.target.partition(":")[0] for part in installed("environment")}
     first = {module: name for name, module in reversed(modules.items())}.values()
     for part in installed("environment"):
-        marks = pytest.mark.shipped if part.name in first else pytest.mark.slow
+        marks = pytest.mark.ci if part.name in first else pytest.mark.slow
         yield pytest.param(part, id=part.name, marks=[] if part.name in QUICK else marks)
 
 

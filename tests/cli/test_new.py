@@ -86,7 +86,7 @@ def tried(packages, tmp_path_factory):
     return {kind: (*said, output) for kind, said in json.loads(file.read_text()).items()}
 
 
-@pytest.mark.shipped
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_own_tests_and_check_pass(kind, packages, tried):
     texts = [path.read_text() for path in packages[kind].glob("tests/*.py")]

@@ -182,7 +182,7 @@ def test_a_run_is_not_overwritten(latest, tmp_path):
 PAGE = Path(__file__).parents[2] / "docs" / "published-checkpoints.md"
 
 
-@pytest.mark.shipped
+@pytest.mark.ci
 def test_every_command_of_the_page_works(latest, wan, data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     latest(content())

@@ -10,7 +10,7 @@ FOLDER = Path(__file__).parents[2] / "examples" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.py"))
 
 
-@pytest.mark.shipped
+@pytest.mark.ci
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
 def test_a_notebook_runs(notebook, tmp_path):
     for simulator in ("mujoco", "pybullet", "taichi"):

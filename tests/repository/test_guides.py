@@ -20,7 +20,7 @@ def test_every_mark_stands_above_a_block():
         assert len(RUN.findall(text)) == text.count("<!-- run -->"), guide.name
 
 
-@pytest.mark.shipped
+@pytest.mark.ci
 @pytest.mark.parametrize("guide", GUIDES, ids=[guide.stem for guide in GUIDES])
 def test_the_code_of_a_guide_runs(guide, tmp_path):
     """In a process of its own, as a reader who copies block after block into one script has it."""

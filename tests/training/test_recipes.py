@@ -62,7 +62,7 @@ def data_of(tmp_path_factory):
         *((name, ()) for name in SMALL),
         ("robot_arm", ("+small",)),
         *(
-            pytest.param(name, ("+small",), marks=pytest.mark.shipped)
+            pytest.param(name, ("+small",), marks=pytest.mark.ci)
             for name in recipe_names()
             if name not in (*SMALL, "robot_arm")
         ),
