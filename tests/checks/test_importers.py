@@ -15,6 +15,7 @@ FLAWS = Flaws(check_importer, checks_of(ImporterChecks))
 NAMES = "names what is missing", "names what has another shape"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("part", installed("importer"), ids=lambda part: part.name)
 def test_installed_importers_conform(part):
     assert failures(check_importer(part.name)) == {}

@@ -73,6 +73,7 @@ def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
     assert 0.4 < latents.std().item() < 2.5
 
 
+@pytest.mark.ci
 def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(train_compact, "MEASURED_BATCHES", 2)

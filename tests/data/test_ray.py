@@ -17,6 +17,7 @@ from ray.cluster_utils import Cluster
 from acwm_executors.ray_cluster import RayExecutor
 
 HERE = str(Path(__file__).parent)
+pytestmark = pytest.mark.ci
 SMALL = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 
 

@@ -20,7 +20,10 @@ submitit_slurm = pytest.importorskip("acwm_executors.slurm", exc_type=ImportErro
 SlurmExecutor = submitit_slurm.SlurmExecutor
 
 HERE = str(Path(__file__).parent)
-pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
+pytestmark = [
+    pytest.mark.ci,
+    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc"),
+]
 
 
 @pytest.fixture

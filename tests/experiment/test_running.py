@@ -5,6 +5,8 @@ import re
 import shutil
 import signal
 
+import pytest
+
 from acwm_experiment.steps import saved_steps
 from acwm_experiment.table import Experiment
 from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
@@ -57,6 +59,7 @@ def test_what_is_done_is_not_done_again(whole, acwm):
     assert results(folder) == before
 
 
+@pytest.mark.ci
 def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
     """While it simulates, trains and evaluates; the last time two at once."""
     write_experiment(tmp_path)

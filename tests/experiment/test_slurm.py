@@ -11,6 +11,7 @@ from tests.experiment.test_running import STEPS, results
 from tests.folders import wait_until
 
 SLURM = ("--executor", "slurm")
+pytestmark = pytest.mark.ci
 
 
 @pytest.fixture

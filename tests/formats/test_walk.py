@@ -44,6 +44,7 @@ def desk(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.ci
 def test_every_step_works(desk):
     text = PAGE.read_text()
     commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)

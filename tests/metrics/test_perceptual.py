@@ -259,6 +259,7 @@ def test_fvd_compares_the_detectors_features(detector):
     assert np.isnan(metric.distance(features[:1]))
 
 
+@pytest.mark.ci
 def test_fvd_conforms(detector):
     results = list(check_metric("fvd", detector=detector))
     assert [str(result) for result in results if not result.passed] == []

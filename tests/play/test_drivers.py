@@ -21,6 +21,7 @@ def known_drivers():
     drivers.Stuck.stopped.clear()
 
 
+@pytest.mark.ci
 def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(pool, tmp_path):
     task = catalog().component("environment", "push_cube").load_task("place")
     goal, actions, distances = drivers.solved("push_cube", task, 3)
@@ -112,6 +113,7 @@ def test_a_pause_lets_it_think_and_a_step_takes_its_actions(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_the_planner_plans_with_the_model_that_is_played(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)

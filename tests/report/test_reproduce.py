@@ -86,6 +86,7 @@ def test_the_overrides_compose_to_the_same_settings(
     assert shlex.split(found[3]) == ["acwm", "report", f"{run}-again"]
 
 
+@pytest.mark.ci
 def test_the_commands_run_and_make_the_same(tmp_path):
     """Trained on one dataset, evaluated on another, with overrides: all lines, from nothing."""
     data = tiny.make_dataset(tmp_path / "the data", ind_test=0, ood_test=0)

@@ -23,6 +23,7 @@ def table(*words):
     return subprocess.run([*command, *sizes], capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.ci
 def test_every_named_environment_gets_a_row():
     pytest.importorskip("mujoco")
     pytest.importorskip("taichi")

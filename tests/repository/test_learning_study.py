@@ -9,6 +9,7 @@ from acwm_core.recipe import compose
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
+@pytest.mark.ci
 def test_variants_compose_and_differ(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     learning = pytest.importorskip("learning")

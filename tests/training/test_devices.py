@@ -158,6 +158,7 @@ def more_runs(runs, data):
     return runs
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["ddp", "fsdp"])
 def test_two_processes_train_as_one(name, runs):
     """Weights, averages and all that is logged."""

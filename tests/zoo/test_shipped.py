@@ -17,6 +17,7 @@ from acwm_zoo.packing import FILES, MAX_BYTES
 from acwm_zoo.shipped import about, folder, shipped
 
 ALL_BYTES = 90_000_000
+pytestmark = pytest.mark.ci
 
 
 def test_they_are_small_and_hold_nothing_else():
