@@ -24,7 +24,8 @@ SMALL = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 @pytest.fixture(scope="module")
 def address():
     before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = HERE  # the workers of the nodes import the square world
+    # The workers of the nodes import the square world, and the tests by their own names.
+    os.environ["PYTHONPATH"] = os.pathsep.join([HERE, str(Path(__file__).parents[2])])
     cluster = Cluster(initialize_head=True, head_node_args={**SMALL, "include_dashboard": False})
     cluster.add_node(**SMALL)
     yield cluster.address
