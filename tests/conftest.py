@@ -37,7 +37,7 @@ DEAREST = (
     "tests/policies/",
     "",
 )
-"""Where tests take long, by measured times; processes side by side then end at about one time."""
+"""Where tests take long, roughly; these come first, so that processes end at about one time."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers
