@@ -38,6 +38,7 @@ from acwm_core.evaluation.storage import (
 )
 from acwm_core.evaluation.summarise import gap, summarise_split
 from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip, magnification
+from acwm_core.evaluation.views import metrics_of_views
 from acwm_core.files import held, writing, written_whole
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import load_run
@@ -149,13 +150,14 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
     metrics, left_out = split_available(
         build_metrics(config.metrics, config.metric_options), bundle.card, estimator
     )
+    of_views, too_small = metrics_of_views(metrics, bundle.card)
     return recipe, Evaluator(
         bundle.world_model.to(choose_device(config.device)),
         bundle.card,
-        metrics,
+        {**metrics, **of_views},
         config,
         estimator=estimator,
-        left_out=left_out,
+        left_out={**left_out, **too_small},
     )
 
 
@@ -172,7 +174,7 @@ def _open_splits(
             )
     datasets = {split: EpisodeDataset(path, cast(Split, split)) for split in splits}
     for dataset in datasets.values():
-        check_actions(dataset, card)
+        check_environment(dataset, card)
     return datasets
 
 
@@ -191,13 +193,18 @@ def dataset_of(run: RunFolder, recipe: Recipe) -> str:
     raise DataError(f"there is no dataset in {path}: {make}name one with --data")
 
 
-def check_actions(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
-    """Check that a dataset has the actions of the environment that a model was trained on.
+def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
+    """Check that a dataset has the actions and views that a model was trained on.
 
     Raises:
         DataError: it has others.
     """
     found = dataset.card.environment
+    if found.views and card.views and found.views != card.views:
+        raise DataError(
+            f"{dataset.path} shows the views {', '.join(found.views)}, but the run was trained on "
+            f"{', '.join(card.views)}: import it with the same --camera, in the same order"
+        )
     if found.action != card.action:
         raise DataError(
             f"{dataset.path} holds {found.name} with the actions {', '.join(found.action.names)}, "
@@ -246,6 +253,7 @@ def _summarise(
         environment={
             **{name: getattr(card, name) for name in ("name", "summary", "fps", "citation")},
             "action": asdict(card.action),
+            **({"views": card.views} if card.views else {}),
         },
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},

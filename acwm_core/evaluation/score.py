@@ -15,6 +15,7 @@ from acwm_core.errors import PluginError, RecipeError, ShapeError, check_shape, 
 from acwm_core.evaluation.clips import Clip, Predictor
 from acwm_core.evaluation.metric import Metric, Prediction, SetMetric
 from acwm_core.evaluation.results import Score
+from acwm_core.evaluation.views import metric_and_view, parts_of
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import MetricChoice, MetricConfig, metric_configs
 
@@ -122,8 +123,8 @@ def measured_in(
 def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
     """Score a prediction with the metrics of its row, in float32 and outside any autocast.
 
-    Of the context frames, only the last is scored. A prediction that is not finite gets the worst
-    score in all metrics.
+    Of the context frames, only the last is scored. Metrics of a view are given that part of the
+    frames. A prediction that is not finite gets the worst score in all metrics.
     """
     clip = prediction.clip
     measured = measured_in(prediction.kind, clip, metrics, prediction.card)
@@ -141,14 +142,16 @@ def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
         curves=dict.fromkeys(metrics, [math.nan] * frames),
         failed=not shown.is_finite,
     )
+    parts = parts_of(shown)
     with torch.autocast("cpu", enabled=False):
         for name, metric in measured.items():
+            part = shown if scored.failed else parts[metric_and_view(name)[1]]
             with noting(f"in metric {name!r} {clip.where}", metric):
-                curve = np.full(frames, metric.worst) if scored.failed else metric.curve(shown)
-                scored.values[name], scored.weights[name] = metric.scored(shown, curve)
+                curve = np.full(frames, metric.worst) if scored.failed else metric.curve(part)
+                scored.values[name], scored.weights[name] = metric.scored(part, curve)
                 scored.curves[name] = curve.astype(np.float32).tolist()
                 if isinstance(metric, SetMetric) and not scored.failed:
-                    features = np.asarray(metric.features(shown))
+                    features = np.asarray(metric.features(part))
                     check_shape(metric, "features", features, 2, -1)
                     scored.features[name] = features.tolist()
     return scored

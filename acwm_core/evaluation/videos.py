@@ -45,7 +45,12 @@ def shown(
     values: Mapping[str, float] | None = None,
 ) -> ShownClip:
     """The video of a prediction and its record, see `VideoRecord`."""
-    panels, frames = case_study(prediction.target, prediction.video, prediction.masks)
+    panels, frames = case_study(
+        prediction.target,
+        prediction.video,
+        prediction.masks,
+        stacked=bool(prediction.card.views),
+    )
     clip = prediction.clip
     return VideoRecord(
         file=file,
@@ -80,19 +85,22 @@ def pick_clips(
 
 
 def case_study(
-    truth: Clip, prediction: Clip, masks: NDArray[np.uint8]
+    truth: Clip, prediction: Clip, masks: NDArray[np.uint8], *, stacked: bool = False
 ) -> tuple[list[list[str]], NDArray[np.uint8]]:
     """The video of a case study, with the names of its panels, row by row.
 
     Truth, prediction and difference stand side by side. If true masks `[T, H, W]` are known (not
     all zero), a fourth panel shows the masks of moving instances over the prediction, and the
-    panels form a 2×2 grid.
+    panels form a 2×2 grid. If `stacked`, all are one below the other, because each is wide.
     """
-    true, predicted, error = panels(truth, prediction)
-    if not masks.any():
-        return [["truth", "prediction", "difference"]], join([true, predicted, error])
-    rows = [join([true, predicted]), join([error, tinted(predicted, moving_instances(masks))])]
-    return [["truth", "prediction"], ["difference", "truth over prediction"]], join(rows, axis=1)
+    names, made = ["truth", "prediction", "difference"], panels(truth, prediction)
+    if masks.any():
+        names.append("truth over prediction")
+        made.append(tinted(made[1], moving_instances(masks)))
+    across = 1 if stacked else 2 if masks.any() else 3
+    firsts = range(0, len(made), across)
+    rows = [join(made[first : first + across]) for first in firsts]
+    return [names[first : first + across] for first in firsts], join(rows, axis=1)
 
 
 def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:

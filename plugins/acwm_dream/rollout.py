@@ -29,7 +29,7 @@ from acwm_core.errors import (
 )
 from acwm_core.evaluation import videos
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.evaluate import check_actions, choose_device
+from acwm_core.evaluation.evaluate import check_environment, choose_device
 from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
 from acwm_core.model.world_model import Mode
@@ -197,7 +197,7 @@ def strip_frames(frames: int) -> list[int]:
 def _read_episode(
     dataset: EpisodeDataset, episode: int, card: EnvironmentCard
 ) -> tuple[Clip, NDArray[np.float32]]:
-    check_actions(dataset, card)
+    check_environment(dataset, card)
     if not 0 <= episode < len(dataset):
         raise DataError(
             f"{dataset.split} of {dataset.path} has no episode {episode}: it has 0 to "

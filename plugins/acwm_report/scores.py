@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from acwm_core.evaluation.protocol import PublishedRow
 from acwm_core.evaluation.results import Estimate, MetricInfo, Summary
+from acwm_core.evaluation.views import metric_and_view
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import Cell, Column, Row, Scale, Table
 from acwm_report.titles import clips_title, split_title
@@ -43,9 +44,10 @@ class ScoreGrid:
         """The columns; with several grids, `heading` distinguishes the columns of this one."""
         columns: list[Column] = []
         for split, name in self.places:
-            group = " · ".join(filter(None, (heading, split_title(split))))
+            metric, view = metric_and_view(name)
+            group = " · ".join(filter(None, (heading, split_title(split), view)))
             key = ("_" if heading is None else " ").join(filter(None, (heading, split, name)))
-            columns.append(Column.of(self.metrics[name], self.scales[name], key, group))
+            columns.append(Column.of(self.metrics[metric], self.scales[name], key, group))
         return columns
 
     def cells(self, scores: ModelScores) -> list[Cell]:

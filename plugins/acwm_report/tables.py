@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.metric import MetricInfo
@@ -15,6 +15,7 @@ from acwm_core.evaluation.results import (
     VideoRecord,
     defined,
 )
+from acwm_core.evaluation.views import metric_and_view, of_view
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
 from acwm_report.run import EvaluatedRun, described
@@ -26,28 +27,38 @@ from acwm_report.videos import EmbeddedVideo
 def score_tables(run: EvaluatedRun) -> list[Table]:
     """One table per split: the scores of every evaluation row in the pixel metrics.
 
-    Out of distribution, a further row shows the change. If there are no pixel metrics, all metrics
-    are shown.
+    Out of distribution, a further row shows the change. Where a frame shows several views, the same
+    rows follow for each. If there are no pixel metrics, all metrics are shown.
     """
-    summary = run.summary
-    scales = {n: run.scale(n) for n in run.metrics("pixels") or summary.metrics}
-    columns = [Column.of(summary.metrics[n], scale, n) for n, scale in scales.items()]
+    metrics = run.summary.metrics
+    places = list(map(metric_and_view, run.metrics("pixels") or metrics))
+    scales = {name: run.scale(name) for name in dict.fromkeys(name for name, _ in places)}
+    columns = [Column.of(metrics[name], scale, name) for name, scale in scales.items()]
     tables: list[Table] = []
-    for split, result in summary.splits.items():
-        rows: list[Row] = []
-        for kind, (row, note) in ROWS.items():
-            scores = result.scores.rows.get(kind, {})
-            cells = [Cell.of(scores.get(name), scale) for name, scale in scales.items()]
-            if any(cell.value is not None for cell in cells):
-                note = result.scores.failures(kind) or note
-                rows.append(Row(row, cells, note, kind, strong=kind == "model"))
-        if split == "ood_test" and summary.gap:
-            change = summary.gap["model"]
-            cells = [Cell.of(change.get(n), scale, signed=True) for n, scale in scales.items()]
-            rows.append(Row("Change out of distribution", cells, "of the model"))
+    for split, result in run.summary.splits.items():
+        views = dict.fromkeys(view for _, view in places)
+        rows = [row for view in views for row in _score_rows(run, split, scales, view)]
         title = _title(split, result)
         tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
     return tables
+
+
+def _score_rows(
+    run: EvaluatedRun, split: str, scales: Mapping[str, Scale], view: str
+) -> Iterator[Row]:
+    """The scores of a split in one view; ``""`` is the whole frame."""
+    result = run.summary.splits[split].scores
+    names = {of_view(name, view): scale for name, scale in scales.items()}
+    for kind, (row, note) in ROWS.items():
+        scores = result.rows.get(kind, {})
+        cells = [Cell.of(scores.get(name), scale) for name, scale in names.items()]
+        if any(cell.value is not None for cell in cells):
+            note = result.failures(kind) or note
+            yield Row(row, cells, note, kind, strong=kind == "model", group=view)
+    if split == "ood_test" and run.summary.gap:
+        change = run.summary.gap["model"]
+        cells = [Cell.of(change.get(name), scale, signed=True) for name, scale in names.items()]
+        yield Row("Change out of distribution", cells, "of the model", group=view)
 
 
 def state_tables(run: EvaluatedRun) -> list[Table]:
