@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -229,9 +230,9 @@ class _Import:
         versions = package_versions()
         tasks = [
             StageTask(
-                _picked(recordings, [index]),
+                _picked(recordings, part),
                 split,
-                index,
+                part,
                 self.reading,
                 fps,
                 versions,
@@ -239,13 +240,26 @@ class _Import:
                 ROWS // len(places) + 1,
             )
             for split, (recordings, places) in self.parts.items()
+            for part in self._together(split, places, bad)
+        ]
+        total = sum(len(task.indices) for task in tasks)
+        with progress_bar(self.recorded.name, total, shown=self.progress) as report:
+            found = [each for some in self.executor.run(stage, tasks, report) for each in some]
+        order = [(task.split, index) for task in tasks for index in task.indices]
+        place = dict(zip(order, range(total), strict=True))
+        return sorted(found, key=lambda each: place[each.scan.split, each.scan.index])
+
+    def _together(
+        self, split: Split, places: Sequence[int], bad: set[tuple[str, int]]
+    ) -> Iterator[tuple[int, ...]]:
+        """The recordings to decode, in parts that one task opens."""
+        wanted = [
+            index
             for index in places
             if (split, index) not in bad or self.options.alignment.on_defect == "trim"
         ]
-        with progress_bar(self.recorded.name, len(tasks), shown=self.progress) as report:
-            found = list(self.executor.run(stage, tasks, report))
-        order = {(task.split, task.index): place for place, task in enumerate(tasks)}
-        return sorted(found, key=lambda each: order[each.scan.split, each.scan.index])
+        for _, part in itertools.groupby(wanted, lambda index: index // self.recorded.together):
+            yield tuple(part)
 
     def _sound(
         self, bad: Mapping[tuple[str, int], list[Defect]], staged: Sequence[Staged]

@@ -3,32 +3,41 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import re
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from numpy.typing import NDArray
+from gymnasium.vector import VectorEnv
 
 from acwm_core.env.card import plain_rate
 from acwm_core.env.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.format import Format
+from acwm_formats.playing import Env, Policy, Several, Single, Stage, Take, Vector, play
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Recording
 
 RANDOM = "random"
-OBSERVATION = "observation"
 FPS = 10  # for environments without `render_fps`
+LAST = (
+    "The vector environment shows the next episode in the step that ends one (SAME_STEP), so the "
+    "last frame and action of episodes that end by themselves are left out."
+)
 
-Policy = Callable[[Any, np.random.Generator], Any]
-"""Maps an observation and the random generator of the episode to an action."""
+
+class Named(NamedTuple):
+    """How to make an environment: its id, or ``module:function``; and how many to step at once."""
+
+    env_id: str
+    envs: int | None = None
 
 
 class Gymnasium(Format):
@@ -42,50 +51,29 @@ class Gymnasium(Format):
         policy: str = RANDOM,
         seed: int = 0,
         frames: int = 1000,
+        envs: int | None = None,
     ) -> RecordedDataset:
         """Import rollouts of the Gymnasium environment ENV_ID, simulated during the import.
 
-        It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first. Actions
-        from a Box keep their values and bounds; actions from a Discrete become one-hot vectors.
-        Observations are kept as state if they are vectors.
+        It is rendered with render_mode="rgb_array"; module:Name-v0 imports a module first, and
+        module:function calls a function that makes an environment, perhaps wrapped, or a vector
+        environment. Actions from a Box keep their values and bounds; actions from a Discrete become
+        one-hot vectors. Observations are kept as state if they are vectors.
 
         Args:
-            env_id: id of the environment, as for `gymnasium.make`.
+            env_id: id of the environment, as for `gymnasium.make`, or a function that makes it.
             episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
                 default.
             policy: Who acts: random, or module:function of an observation and a random generator.
             seed: Seed of the dataset: of every episode's start and policy.
             frames: End episodes after this many frames.
+            envs: How many to step at once, as a vector environment.
         """
-        counts, name = _counts(episodes, frames), _name(env_id)
-        env = _environment(env_id)
-        _policy(policy, env)  # which must be there
-        made: dict[Split, Rollouts] = {
-            split: Rollouts(env_id, policy, EpisodeSpec(name, split, seed=seed), frames, count)
-            for split, count in counts.items()
-            if count
-        }
-        if not made:
-            raise RecipeError("there are no episodes to make: every split has 0")
-        fps = env.metadata.get("render_fps")
-        return RecordedDataset(
-            name,
-            made,
-            {"kind": "gymnasium", "name": env_id, "version": version("gymnasium")},
-            fps=plain_rate(fps or FPS),
-            options={
-                "episodes": ",".join(map(str, counts.values())),
-                "policy": policy,
-                "seed": seed,
-                "frames": frames,
-            },
-            actions=_action(env_id, env.action_space),
-            notes=() if fps else (f"The environment has no render_fps; {FPS} are assumed.",),
-            seed=seed,
-            costly=True,
-            summary=f"{env_id} under the policy {policy}",
-            engine="Gymnasium",
-        )
+        asked = {"policy": policy, "seed": seed, "frames": frames}
+        found = rollouts(Named(env_id, envs), _name(env_id), episodes, policy, seed, frames)
+        counts = ",".join(map(str, _counts(episodes).values()))
+        facts = {"kind": "gymnasium", "name": env_id, "version": version("gymnasium")}
+        return replace(found, facts=facts, options={"episodes": counts, **asked, "envs": envs})
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
@@ -94,12 +82,64 @@ class Gymnasium(Format):
         return {"env_id": square, "episodes": (2, 1), "frames": 6}
 
 
-def _counts(episodes: tuple[int, ...], frames: int) -> dict[Split, int]:
+def rollouts(
+    env: Env | Vector | Named,
+    name: str,
+    episodes: tuple[int, ...],
+    policy: str | Policy = RANDOM,
+    seed: int = 0,
+    frames: int = 1000,
+) -> RecordedDataset:
+    """Rollouts of an environment to import; one that exists already must be imported by no workers.
+
+    Args:
+        env: an environment, a vector environment, or how to make one; it renders ``rgb_array``.
+        name: what to call it, one word.
+        episodes: how many for train, and perhaps for ind_test; else a tenth more.
+        policy: who acts: a function of an observation and a random generator, or its name.
+        seed: seed of the dataset.
+        frames: most frames of an episode.
+
+    Raises:
+        RecipeError: the environment or the policy cannot be made, or there is nothing to make.
+        DataError: it does not render frames, or has other actions than `Box` with finite bounds and
+            `Discrete`.
+    """
+    counts = _counts(episodes)
+    if frames < 2:
+        raise RecipeError(f"--frames {frames}: give at least 2, with an action between them")
+    stage = _stage(env)
+    _policy(policy)  # which must be there
+    made: dict[Split, Rollouts] = {
+        split: Rollouts(env, policy, EpisodeSpec(name, split, seed=seed), frames, count)
+        for split, count in counts.items()
+        if count
+    }
+    if not made:
+        raise RecipeError("there are no episodes to make: every split has 0")
+    fps = stage.metadata.get("render_fps")
+    notes = () if fps else (f"The environment has no render_fps; {FPS} are assumed.",)
+    acts = policy if isinstance(policy, str) else getattr(policy, "__name__", "of its owner")
+    shown = env.env_id if isinstance(env, Named) else name
+    return RecordedDataset(
+        name,
+        made,
+        {"kind": "gymnasium", "name": name, "version": version("gymnasium")},
+        fps=plain_rate(fps or FPS),
+        actions=_action(shown, stage.action_space),
+        notes=notes if stage.shows_last else (*notes, LAST),
+        seed=seed,
+        costly=True,
+        together=stage.count,
+        summary=f"{shown} under the policy {acts}",
+        engine="Gymnasium",
+    )
+
+
+def _counts(episodes: tuple[int, ...]) -> dict[Split, int]:
     if not 1 <= len(episodes) <= 2 or min(episodes) < 0:
         given = ",".join(map(str, episodes))
         raise RecipeError(f"--episodes {given}: give a number such as 100, or 100,10")
-    if frames < 2:
-        raise RecipeError(f"--frames {frames}: give at least 2, with an action between them")
     train, *test = episodes
     return {"train": train, "ind_test": test[0] if test else max(2, train // 10)}
 
@@ -109,12 +149,12 @@ def _name(env_id: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_").lower()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # what was played last is remembered by identity
 class Rollouts:
     """The rollouts of one split; `spec` is the one of episode 0."""
 
-    env_id: str
-    policy: str
+    env: Env | Vector | Named
+    policy: str | Policy
     spec: EpisodeSpec
     frames: int
     count: int
@@ -125,40 +165,73 @@ class Rollouts:
 
     def __getitem__(self, index: int) -> Recording:
         """Play a rollout; if the environment is deterministic, an index always gives the same."""
-        env = _environment(self.env_id)
-        spec = EpisodeSpec(self.spec.environment, self.spec.split, index, self.spec.seed)
-        rng = spec.rng("policy")
-        env.action_space.seed(int(rng.integers(2**31)))
-        act = _policy(self.policy, env)
-        observation, _ = env.reset(seed=int(spec.rng("reset").integers(2**31)))
-        images, taken = [_frame(env)], list[NDArray[np.float32]]()
-        seen = [np.array(observation)]  # copies: an environment may reuse its arrays
-        ended = False
-        while not ended and len(images) < self.frames:
-            action = act(observation, rng)
-            taken.append(_vector(env.action_space, action))
-            observation, _, terminated, truncated, _ = env.step(action)
-            images.append(_frame(env))
-            seen.append(np.array(observation))
-            ended = terminated or truncated
-        space: Any = env.observation_space
-        vectors = isinstance(space, Box) and len(space.shape) == 1
-        if len({image.shape for image in images}) > 1:
-            raise DataError("its render() returns frames of several sizes")
-        states = {OBSERVATION: np.stack(seen)} if vectors else {}
-        return Recording(np.stack(images), np.stack(taken), states)
+        stage = _stage(self.env)
+        take = _played(self, index // stage.count)[index % stage.count]
+        return take.recording(stage.observation_space)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is sent to workers.
+
+        Raises:
+            DataError: the environment exists already.
+        """
+        if not isinstance(self.env, Named):
+            raise DataError(
+                "an environment that exists already cannot be sent to workers: import it with "
+                "workers=0, or give the name of a function that makes it"
+            )
+        return self.__dict__
 
 
 @functools.lru_cache(maxsize=1)
-def _environment(env_id: str) -> gymnasium.Env[Any, Any]:
+def _played(made: Rollouts, batch: int) -> Sequence[Take]:
+    """Rollouts that are played at once."""
+    stage, spec = _stage(made.env), made.spec
+    numbers = range(batch * stage.count, (batch + 1) * stage.count)
+    specs = [EpisodeSpec(spec.environment, spec.split, index, spec.seed) for index in numbers]
+    return play(stage, _policy(made.policy), specs, made.frames)
+
+
+@functools.lru_cache(maxsize=1)
+def _stage(source: Env | Vector | Named) -> Stage:
     """The environment of this process, cached because it can be expensive to create."""
+    env = _environment(source) if isinstance(source, Named) else source
+    return Several(env) if isinstance(env, VectorEnv) else Single(env)
+
+
+def _environment(named: Named) -> Env | Vector:
+    env_id, envs = named
     with _from_here():
         try:
-            return gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)  # pyright: ignore[reportUnknownMemberType]
+            if (make := _function(env_id)) is not None:
+                return _made_by(make, named)
+            if envs is None:
+                return gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)  # pyright: ignore[reportUnknownMemberType]
+            if envs < 1:
+                raise RecipeError(f"--envs {envs}: give at least 1")
+            return gymnasium.make_vec(env_id, envs, render_mode="rgb_array")
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
             raise RecipeError(f"Gymnasium cannot make {env_id!r}: {error}") from error
         except TypeError as error:
             raise DataError(f"{env_id} takes no render_mode='rgb_array' ({error})") from error
+
+
+def _function(env_id: str) -> Callable[[], Any] | None:
+    """The function of ``module:function``, if it is no id that the module registers."""
+    module, colon, name = env_id.partition(":")
+    if not colon or not name.isidentifier():
+        return None
+    found = getattr(importlib.import_module(module), name, None)
+    return found if callable(found) and name not in gymnasium.registry else None
+
+
+def _made_by(make: Callable[[], Any], named: Named) -> Env | Vector:
+    if named.envs is not None:
+        raise RecipeError("--envs is for ids: let the function return a vector environment")
+    env = make()
+    if not isinstance(env, gymnasium.Env | VectorEnv):
+        raise RecipeError(f"{named.env_id} returns {type(env).__name__}, no environment")
+    return cast("Env | Vector", env)
 
 
 class _from_here:
@@ -172,22 +245,27 @@ class _from_here:
         sys.path.remove(self._path)
 
 
-def _policy(name: str, env: gymnasium.Env[Any, Any]) -> Policy:
-    if name == RANDOM:
-        return lambda observation, rng: env.action_space.sample()
+def _policy(policy: str | Policy) -> Policy | None:
+    """The function that acts; None samples actions."""
+    if policy == RANDOM:
+        return None
+    if not isinstance(policy, str):
+        return policy
     with _from_here():
         try:
-            found: object = resolve_name(name)
+            found: object = resolve_name(policy)
         except (ImportError, AttributeError, ValueError) as error:
             raise RecipeError(
-                f"there is no policy {name!r} ({error}): give random, or module:function"
+                f"there is no policy {policy!r} ({error}): give random, or module:function"
             ) from error
     if not callable(found):
-        raise RecipeError(f"the policy {name} is not a function of an observation and a generator")
+        raise RecipeError(
+            f"the policy {policy} is not a function of an observation and a generator"
+        )
     return found
 
 
-def _action(env_id: str, space: gymnasium.Space[Any]) -> ActionFacts:
+def _action(env_id: str, space: Any) -> ActionFacts:
     if isinstance(space, Discrete):
         count = int(space.n)
         names = tuple(f"action_{i + int(space.start)}" for i in range(count))
@@ -205,20 +283,3 @@ def _action(env_id: str, space: gymnasium.Space[Any]) -> ActionFacts:
             "environment whose Box has the bounds that are used, and import that"
         )
     return ActionFacts(bounds=(tuple(low.tolist()), tuple(high.tolist())))
-
-
-def _vector(space: gymnasium.Space[Any], action: Any) -> NDArray[np.float32]:
-    if isinstance(space, Discrete):
-        return np.eye(int(space.n), dtype=np.float32)[int(action) - int(space.start)]
-    return np.array(action, np.float32).reshape(-1)
-
-
-def _frame(env: gymnasium.Env[Any, Any]) -> NDArray[np.uint8]:
-    try:
-        frame = np.array(env.render())
-    except Exception as error:  # e.g. OpenGL or a drawing library is missing
-        reason = f"{type(error).__name__}: {error}"
-        raise DataError(f"the environment cannot be rendered ({reason})") from error
-    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-        raise DataError("its render() returns no uint8 frame [H, W, 3]")
-    return frame

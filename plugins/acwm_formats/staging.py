@@ -40,11 +40,11 @@ ORDER = "episodes.json"
 
 @dataclass(frozen=True)
 class StageTask:
-    """One recording to decode."""
+    """Recordings of one split to decode."""
 
     recordings: Recordings
     split: Split
-    index: int
+    indices: tuple[int, ...]
     reading: Reading
     fps: float
     versions: Mapping[str, str]
@@ -59,26 +59,32 @@ class Staged(NamedTuple):
     files: tuple[str, ...]
 
 
-def stage(task: StageTask, report: Report) -> Staged:
-    """Decode the episodes of a recording into the folder, but those that are there; reports it.
+def stage(task: StageTask, report: Report) -> list[Staged]:
+    """Decode the episodes of recordings into the folder, but those that are there; reports each.
 
     Raises:
         DataError: the folder cannot be written.
     """
-    name = episode_name(task.split, task.index)
+    made: list[Staged] = []
+    for index in task.indices:
+        made.append(_recording(task, index))
+        report(1)
+    return made
+
+
+def _recording(task: StageTask, index: int) -> Staged:
+    name = episode_name(task.split, index)
     files: list[str] = []
     try:
-        recording = opened(task.recordings, task.index, name, task.reading.fps)
+        recording = opened(task.recordings, index, name, task.reading.fps)
         aligned = task.reading.planned(recording)
         name = recording.name
         for episode in aligned.episodes:
             files.append(_staged(task, recording, episode))
     except (DataError, OSError) as error:
-        found = Scan.of_defect(task.split, task.index, name, str(error))
+        found = Scan.of_defect(task.split, index, name, str(error))
         return Staged(found, ())
-    finally:
-        report(1)
-    return Staged(scanned(task.split, task.index, aligned, task.sampled, ()), tuple(files))
+    return Staged(scanned(task.split, index, aligned, task.sampled, ()), tuple(files))
 
 
 def _staged(task: StageTask, recording: TimedRecording, episode: PlannedEpisode) -> str:

@@ -204,6 +204,8 @@ class RecordedDataset:
         seed: seed of the dataset, if the recordings were made with one.
         costly: opening a recording is as much work as reading it, e.g. because it is simulated. So
             each is opened once, and `fps` and the bounds of `actions` must be given.
+        together: how many recordings, from a multiple of it on, are made at once when one of them
+            is opened; one worker opens them.
         summary: one sentence about the data.
         engine: what made it.
         citation: its source.
@@ -221,6 +223,7 @@ class RecordedDataset:
     notes: tuple[str, ...] = ()
     seed: int = 0
     costly: bool = False
+    together: int = 1
     summary: str = ""
     engine: str = "recorded"
     citation: str = ""

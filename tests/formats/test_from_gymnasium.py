@@ -12,7 +12,7 @@ import pytest
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.check import check_dataset
-from acwm_formats.rollouts import Gymnasium
+from acwm_formats.rollouts import Gymnasium, rollouts
 from tests.formats import toy_envs
 from tests.formats.conftest import imported
 
@@ -88,6 +88,59 @@ def test_arrays_that_are_used_again_are_copied(tmp_path):
     assert episode.actions[:, 0].tolist() == [1, 2, 3, 4, 0]
 
 
+COUNTING = "tests.formats.toy_envs:Toy/Counting-v0"
+
+
+def whole_episodes(path):
+    """The shape, frames and actions of each episode, in which every frame is of one episode."""
+    for split in ("train", "ind_test"):
+        for episode in EpisodeDataset(path, split):
+            resets, steps, last = episode.video[:, 8, 8].T.tolist()
+            taken = episode.actions[:-1].argmax(1).tolist()
+            assert len(set(resets)) == 1
+            assert steps == list(range(len(episode.video)))
+            assert last == [0, *taken]
+            assert episode.states["observation"][:, 0].tolist() == steps
+            yield len(steps), taken
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled", "SameStep"])
+def test_a_vector_environment_gives_the_episodes_of_a_single_one(tmp_path, mode):
+    load(COUNTING, tmp_path / "single", episodes=(7, 2))
+    single = list(whole_episodes(tmp_path / "single"))
+    recorded = rollouts(toy_envs.several(mode), "counting", (7, 2))
+    card = imported(recorded, tmp_path / "several")
+    several = list(whole_episodes(tmp_path / "several"))
+    assert len({length for length, _ in single}) > 2
+    assert card.environment.fps == 10
+    if mode == "SameStep":  # the last frame is never shown
+        assert several == [(length - 1, taken[:-1]) for length, taken in single]
+        assert "last frame" in card.source["notes"][0]
+    else:
+        assert several == single
+
+
+@pytest.mark.parametrize("envs", [{"envs": 4}, {}])
+def test_vector_environments_in_workers(tmp_path, envs):
+    source = COUNTING if envs else "tests.formats.toy_envs:next_step_in_processes"
+    card = load(source, tmp_path / "data", workers=1, episodes=(5, 1), **envs)
+    single = rollouts(toy_envs.Counting("rgb_array"), card.environment.name, (5, 1))
+    imported(single, tmp_path / "single")
+    found = [list(whole_episodes(tmp_path / name)) for name in ("data", "single")]
+    assert found[0] == found[1]
+
+
+def test_a_wrapper_that_a_function_makes(tmp_path):
+    load("tests.formats.toy_envs:wrapped", tmp_path / "data")
+    assert {length for length, _ in whole_episodes(tmp_path / "data")} == {3, 4}
+
+
+def test_a_vector_environment_that_takes_one_seed(tmp_path):
+    load("tests.formats.toy_envs:Toy/Batch-v0", tmp_path / "data", episodes=(3, 1), envs=2)
+    found = list(whole_episodes(tmp_path / "data"))
+    assert [length for length, _ in found] == [2, 3, 2, 2]  # the environment i ends after i + 1
+
+
 def test_our_own_environments_come_in(tmp_path):
     counts = (1, 0)
     card = load("acwm:acwm/push_cube-v0", tmp_path / "data", episodes=counts, frames=3, size=64)
@@ -120,6 +173,20 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
         DataError, match=r"episode 0 of train: the action action_1 is 9 in row 0, .* \[-1, 1\]"
     ):
         load(DOT, tmp_path / "data", policy="tests.formats.toy_envs:too_far")
+    for env_id, envs, problem in (
+        (DOT, 0, "--envs 0"),
+        ("tests.formats.toy_envs:same_step", 2, "--envs is for ids"),
+        ("tests.formats.toy_envs:np", None, "cannot make"),
+        ("tests.formats.toy_envs:Dot", 2, "--envs is for ids"),
+    ):
+        with pytest.raises(RecipeError, match=problem):
+            load(env_id, tmp_path / "data", envs=envs)
+    silent = toy_envs.several("NextStep")
+    del silent.metadata["autoreset_mode"]
+    with pytest.raises(DataError, match="autoreset_mode"):
+        rollouts(silent, "silent", COUNTS)
+    with pytest.raises(DataError, match="workers=0"):
+        imported(rollouts(toy_envs.several("NextStep"), "counting", COUNTS), tmp_path / "live", 1)
     with pytest.raises(RecipeError, match="no episodes to make"):
         load(DOT, tmp_path / "data", episodes=(0, 0))
     with pytest.raises(RecipeError, match="give a number such as 100, or 100,10"):

@@ -56,10 +56,10 @@ def test_every_step_works(desk):
         words += QUICK_EVALUATION if words[0] == "evaluate" else ()
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, f"{line}: {result.output}"
-    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
-    exec(compile(code, str(PAGE), "exec"), {"__name__": "walk"})
+    for code in re.findall(r"^```python\n(.*?)^```", text, re.M | re.S):
+        exec(compile(code, str(PAGE), "exec"), {"__name__": "walk"})
     made = {path.parent.name for path in Path("data").rglob("card.yaml")}
     shown = set(re.findall(r"--out data/(\w+)", text))
-    assert made == {*shown, "arm", "reacher"} - {"published"}
+    assert made == {*shown, "arm", "cubes", "reacher"} - {"published"}
     assert DatasetCard.read("data/arm").splits == {"train": 2, "ind_test": 2}
     assert Path("runs/small/report.html").is_file()

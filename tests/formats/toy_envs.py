@@ -5,6 +5,8 @@ from typing import ClassVar
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 
 class Dot(gymnasium.Env):
@@ -105,3 +107,84 @@ def counting(observation, rng):
 
 
 gymnasium.register("Toy/Reusing-v0", f"{HERE}:Reusing")
+
+
+class Counting(gymnasium.Env):
+    """Draws how often it was reset, its step and its last action; ends after 2 to 6 steps."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
+    action_space = Discrete(200)
+    observation_space = Box(0, 99, (1,), np.float64)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self._resets = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._resets += 1
+        self._step, self._action = 0, 0
+        self._length = int(self.np_random.integers(2, 7))
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self._step, self._action = self._step + 1, int(action)
+        ended = self._step == self._length
+        return np.full(1, self._step, float), 0.0, ended and self._length % 2 == 0, ended, {}
+
+    def render(self):
+        frame = np.zeros((16, 16, 3), np.uint8)
+        frame[:] = self._resets, self._step, self._action
+        return frame
+
+
+gymnasium.register("Toy/Counting-v0", f"{HERE}:Counting")
+
+
+class Batch(gymnasium.vector.VectorEnv):
+    """Steps arrays, so it takes one seed for all; the environment i ends after i + 1 steps."""
+
+    metadata: ClassVar = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    single_action_space, single_observation_space = Discrete(200), Box(0, 99, (1,), np.float64)
+
+    def __init__(self, num_envs, render_mode):
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._steps, self._resets, self._last = np.zeros((3, self.num_envs), int)
+        return self._steps[:, None].astype(float), {}
+
+    def step(self, actions):
+        again = self._steps > np.arange(self.num_envs)
+        self._steps, self._last = np.where(again, 0, (self._steps + 1, actions))
+        self._resets += again
+        ended = self._steps > np.arange(self.num_envs)
+        return self._steps[:, None].astype(float), 0.0 * ended, ended, False & ended, {}
+
+    def render(self):
+        shown = np.stack([self._resets, self._steps, self._last], -1).astype(np.uint8)
+        return tuple(np.tile(each, (16, 16, 1)) for each in shown)
+
+
+gymnasium.register("Toy/Batch-v0", vector_entry_point=f"{HERE}:Batch")
+
+
+def several(mode, kind=gymnasium.vector.SyncVectorEnv):
+    """Three of them at once."""
+    return kind([lambda: Counting("rgb_array")] * 3, autoreset_mode=mode)
+
+
+def same_step():
+    return several("SameStep")
+
+
+def next_step_in_processes():
+    return several("NextStep", gymnasium.vector.AsyncVectorEnv)
+
+
+def wrapped():
+    """A wrapper that nothing registers."""
+    return gymnasium.wrappers.TimeLimit(Counting("rgb_array"), 3)
