@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import resource_tracker
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.context import (
+    BaseContext,
+    ForkServerContext,
+    ForkServerProcess,
+    SpawnContext,
+)
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any, TypeVar
@@ -167,14 +173,14 @@ class LocalExecutor(Executor):
         if not self.workers or not tasks:
             yield from (function(task, report) for task in tasks)
             return
-        context = multiprocessing.get_context("spawn")  # forked simulators hang
+        context = worker_context(function.__module__)
         heartbeat, lifeline = context.Pipe(duplex=False)
         done_units: SimpleQueue[int] = context.SimpleQueue()
         pool = ProcessPoolExecutor(
             min(self.workers, len(tasks)), context, _start_worker, (heartbeat, done_units)
         )
         try:
-            with without_interrupts():
+            with without_interrupts(context):
                 pending = {pool.submit(_run_task, function, task) for task in tasks}
             while pending:
                 finished: set[Future[Result]]
@@ -196,16 +202,49 @@ class LocalExecutor(Executor):
             lifeline.close()
 
 
+class _Worker(ForkServerProcess):
+    """A process forked from the server, with the variables of the shell as they are now."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._environment = dict(os.environ)
+
+    def run(self) -> None:
+        os.environ.clear()  # that of the moment when the server was started
+        os.environ.update(self._environment)
+        super().run()
+
+
+class _WorkerContext(ForkServerContext):
+    Process = _Worker
+
+
+def worker_context(*preload: str) -> ForkServerContext | SpawnContext:
+    """How worker processes are started.
+
+    Simulators and threads of this process do not survive a fork. So workers are forked from a
+    server, a process that does nothing but import the modules `preload`, and only once; or begin as
+    new processes where frameworks of the system bear no fork (macOS, Windows).
+    """
+    if sys.platform != "linux":
+        return SpawnContext()
+    context = _WorkerContext()
+    context.set_forkserver_preload(["__main__", *preload])
+    return context
+
+
 @contextlib.contextmanager
-def without_interrupts() -> Generator[None]:
+def without_interrupts(context: BaseContext) -> Generator[None]:
     """Block Ctrl-C for a moment, so that only this process handles it and not its new children.
 
-    Processes started in the block inherit the blocked signal, so Ctrl-C does not interrupt their
-    start either.
+    Processes of the context that are started in the block inherit the blocked signal, so Ctrl-C
+    does not interrupt their start either.
     """
     resource_tracker.ensure_running()  # starting it in the block would unblock Ctrl-C again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
+        if isinstance(context, ForkServerContext):
+            forkserver.ensure_running()
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -17,6 +17,7 @@ from xdist.scheduler import LoadFileScheduling
 
 from acwm_core.plugins import catalog
 from tests.browsing import chromium
+from tests.scripts import start_server
 
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -38,6 +39,12 @@ DEAREST = (
     "",
 )
 """Where tests take long, roughly; these come first, so that processes end at about one time."""
+
+
+def pytest_configure(config):
+    """In a run of many tests, workers are forked from a process that has imported what is slow."""
+    if hasattr(config, "workerinput"):
+        start_server()
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers

@@ -4,17 +4,24 @@ import multiprocessing
 import os
 import runpy
 import sys
+from multiprocessing import forkserver
 from pathlib import Path
 
 SLOW = ["torch", "lightning", "torchmetrics", "matplotlib.pyplot", "scipy.optimize", "gymnasium"]
 """Other libraries: nothing of acwm, so that a script has to import what it uses."""
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(SLOW)
+
+
+def start_server():
+    """Let this process's workers, too, be forked from a process with these libraries."""
+    CONTEXT.set_forkserver_preload(SLOW)
+    forkserver.ensure_running()
 
 
 def run_script(script, folder, **environment):
     """Run a script in a folder, which must succeed."""
+    start_server()
     said = folder / "said.txt"
     process = CONTEXT.Process(target=_become, args=(str(script), folder, said, environment))
     process.start()

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from acwm_core.data.clips import Clips
 from acwm_core.errors import DataError
-from acwm_core.executors import without_interrupts
+from acwm_core.executors import without_interrupts, worker_context
 
 WORKER_DIED = (
     "a process that reads data died, perhaps out of memory: run the same command again with "
@@ -165,14 +165,14 @@ class ClipLoader:
         pin_memory: bool = False,
     ) -> None:
         streams = isinstance(clips, IterableDataset)
+        self._context = worker_context(__name__)
         self.order = sampler
         self._loader: DataLoader[Any] = DataLoader(
             clips if streams else _Batches(clips),
             batch_size=None,
             sampler=None if streams else sampler,
             num_workers=workers,
-            # Simulators and thread pools of the parent process do not survive a fork.
-            multiprocessing_context="spawn" if workers else None,
+            multiprocessing_context=self._context if workers else None,
             pin_memory=pin_memory,
         )
 
@@ -186,7 +186,7 @@ class ClipLoader:
         Raises:
             DataError: a shard is missing or damaged, or a worker died.
         """
-        with without_interrupts():
+        with without_interrupts(self._context):
             batches = iter(self._loader)
         places = self.order.places()
         while True:

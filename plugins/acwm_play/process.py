@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal
 from acwm_core.errors import PluginError, RecipeError, sentence
+from acwm_core.executors import worker_context
 from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import SCENES, Scene, Simulator, TaskProgress, TimeStep
 
@@ -39,7 +39,7 @@ class SimulatorProcess:
 
     def __init__(self, environment: str, size: tuple[int, int]) -> None:
         self._name = environment
-        context = multiprocessing.get_context("spawn")
+        context = worker_context(__name__)
         self._connection, other_end = context.Pipe()
         self._process = context.Process(
             target=_simulate, args=(other_end, environment, size), daemon=True

@@ -4,6 +4,7 @@ import errno
 import functools
 import io
 import json
+import os
 import shlex
 import shutil
 
@@ -251,6 +252,13 @@ def test_progress_counts_every_episode():
     assert list(LocalExecutor(2).run(_double, [], counted.append)) == []
 
 
+def test_workers_have_the_variables_of_the_shell_as_they_are_now(monkeypatch):
+    for value in ("1", "2"):
+        monkeypatch.setenv("ACWM_TEST", value)
+        found = list(LocalExecutor(2).run(_variable, ["ACWM_TEST"] * 2, lambda units: None))
+        assert found == [value] * 2
+
+
 def test_the_bar_tells_rate_and_remaining_time_of_what_was_missing(monkeypatch):
     """Ten episodes were there; the others take a minute and a half each."""
     screen, now = io.StringIO(), [1000.0]
@@ -270,6 +278,10 @@ def test_the_bar_tells_rate_and_remaining_time_of_what_was_missing(monkeypatch):
     last = screen.getvalue().rpartition("square")[2]
     assert "14/18 episodes 0.7/min" in last
     assert "0:06:00" in last
+
+
+def _variable(name, report):
+    return os.environ[name]
 
 
 def _double(number, report):

@@ -43,11 +43,15 @@ def start(out):
 
 
 def children(pid):
-    """The worker processes of `pid`; its resource tracker ends by itself."""
-    listed = [
-        c for path in Path(f"/proc/{pid}/task").glob("*/children") for c in path.read_text().split()
-    ]
-    return [int(c) for c in listed if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+    paths = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for path in paths for child in path.read_text().split()]
+
+
+def workers_of(pid):
+    """The worker processes of `pid`, which are children of its server."""
+    commands = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children(pid)}
+    servers = [child for child, command in commands.items() if b"forkserver" in command]
+    return [worker for server in servers for worker in children(server)]
 
 
 def alive(pid):
@@ -55,12 +59,12 @@ def alive(pid):
     return state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="watches processes in /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="watches processes in /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     out = tmp_path / "data"
     process = start(out)
-    workers = children(process.pid)
+    workers = workers_of(process.pid)
     assert len(workers) == 2
     process.send_signal(how)
     process.communicate(timeout=PATIENCE)
@@ -102,11 +106,11 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
     assert checksums(out) == uninterrupted
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="watches processes in /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="watches processes in /proc")
 def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted):
     out = tmp_path / "data"
     process = start(out)
-    os.kill(children(process.pid)[0], signal.SIGKILL)
+    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, complaint = process.communicate(timeout=PATIENCE)
     assert process.returncode != 0
     assert "a worker process died, perhaps out of memory" in complaint
