@@ -1,37 +1,28 @@
-"""The format MCAP: logs of robots, with compressed images and a topic of numbers."""
+"""The format MCAP: logs of robots, with compressed images or video, and a topic of numbers."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import io
 import json
-import re
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.decoder import DecoderFactory
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_protobuf.decoder import DecoderFactory as Protobuf
-from mcap_ros2.decoder import DecoderFactory as Ros2
-from numpy.typing import NDArray
 from PIL import Image
 
 from acwm_core.errors import DataError, suggest
-from acwm_core.files import parse_json
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
+from acwm_formats.mcap_images import Camera, is_image, is_video
+from acwm_formats.mcap_messages import Column, Numbers, entries, topics
 from acwm_formats.names import natural, word, words
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 MAGIC = b"\x89MCAP0\r\n"
-UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
-"""Fields of messages that hold no action."""
 
 
 class Log(NamedTuple):
@@ -66,12 +57,13 @@ class MCAP(Format):
     ) -> RecordedDataset:
         """Import an MCAP file, or a folder of them, one episode each.
 
-        Messages of images (CompressedImage of ROS 2 or Foxglove) and of numbers are brought
-        together by the times at which they were logged.
+        Messages of images (CompressedImage of ROS 2 or Foxglove), of video (CompressedVideo of
+        Foxglove in H.264 or H.265) and of numbers are brought together by the times at which they
+        were logged.
 
         Args:
             root: the file or folder.
-            video: Topics of images, with a comma between; all by default.
+            video: Topics of images or video, with a comma between; all by default.
             actions: Topic of the actions, or TOPIC:FIELD; by default the only one with numbers.
             states: Topics of the states, or TOPIC:FIELD, with a comma between; none by default.
         """
@@ -79,25 +71,26 @@ class MCAP(Format):
         files = _files(root)
         if not files:
             raise DataError(f"{root} is no MCAP file and holds none")
-        kinds = _topics(files[0])
-        images = [topic for topic, kind in kinds.items() if _is_image(kind)]
-        log = Log(
-            _known(files[0], words(video), kinds) or tuple(images),
-            _actions(files[0], actions, kinds, images),
-            words(states),
-        )
-        _known(files[0], [each.partition(":")[0] for each in (log.actions, *log.states)], kinds)
-        if not log.cameras:
-            raise DataError(f"{files[0]} has no topic of compressed images, only {_told(kinds)}")
-        names, _, _ = _numbers(files[0], log.actions)
+        first, kinds = files[0], topics(files[0])
+        filmed = [topic for topic, kind in kinds.items() if is_image(kind) or is_video(kind)]
+        cameras = words(video) or tuple(filmed)
+        if not cameras:
+            raise DataError(f"{first} has no topic of images or video, only {_told(kinds)}")
+        asked = [each.partition(":")[0] for each in words(states)] + [
+            (actions or "").partition(":")[0]
+        ]
+        for topic in (*cameras, *filter(None, asked)):
+            if topic not in kinds:
+                raise DataError(f"{first} has no topic {topic!r}{suggest(topic, kinds)}")
+        wanted, found = _actions(first, actions, [t for t in kinds if t not in filmed])
         return RecordedDataset(
             name=word(root),
-            splits=Logs(tuple(files), log),
+            splits=Logs(tuple(files), Log(cameras, wanted, words(states))),
             facts={"kind": "mcap", "name": root.resolve().name, "files": len(files)}
             | {"bytes": sum(path.stat().st_size for path in files)},
             options={"video": video, "actions": actions, "states": states},
-            actions=ActionFacts(names),
-            notes=(f"Actions are {log.actions}; its times are those of the log.",),
+            actions=ActionFacts(found.names),
+            notes=(f"Actions are {wanted}; its times are those of the log.",),
             summary=f"Logs of {root.resolve().name}",
         )
 
@@ -122,46 +115,46 @@ class Logs:
         return len(self.files)
 
     def __getitem__(self, index: int) -> TimedRecording:
-        """Open one file; times count from its first message of an image."""
-        path = self.files[index]
-        stamps = {topic: _times(path, topic) for topic in self.log.cameras}
-        zero = min((int(each[0]) for each in stamps.values() if len(each)), default=0)
-        cameras = {
-            topic.strip("/").replace("/", "."): ImageFrames(
-                LoggedImages(path, topic, len(each)),
-                (each - zero) / 1e9,
-                stamp=f"{topic} {file_stamp(path)}",
-            )
-            for topic, each in stamps.items()
-        }
-        states = {
-            topic.strip("/").replace("/", "."): _samples(path, topic, zero)
-            for topic in self.log.states
-        }
-        return TimedRecording(path.name, cameras, _samples(path, self.log.actions, zero), states)
+        """Open one file; times count from its first frame that can be shown.
+
+        Frames of a video before its first key frame cannot, so it has fewer than it claims.
+        """
+        path, log = self.files[index], self.log
+        cameras = [Camera(topic) for topic in log.cameras]
+        columns = {name: Column(name) for name in (log.actions, *log.states)}
+        _gathered(path, cameras, columns)
+        zero = min((int(each.times[0]) for each in cameras if len(each.times)), default=0)
+
+        def samples(name: str) -> Samples:
+            numbers = columns[name].numbers()
+            return Samples(numbers.rows, (numbers.times - zero) / 1e9)
+
+        return TimedRecording(
+            path.name,
+            {_name(each.topic): _frames(path, each, zero) for each in cameras},
+            samples(log.actions),
+            {_name(name): samples(name) for name in log.states},
+            length=cameras[0].logged if cameras[0].logged > len(cameras[0].times) else None,
+        )
 
 
-class LoggedImages(Sequence[Any]):
-    """The pictures of a topic, best read in order."""
+def _gathered(path: Path, cameras: Sequence[Camera], columns: Mapping[str, Column]) -> None:
+    """Give each message of the file to those who gather its topic, in one scan."""
+    by_topic: dict[str, list[Camera | Column]] = {}
+    for each in (*cameras, *columns.values()):
+        by_topic.setdefault(each.topic, []).append(each)
+    for entry in entries(path, list(by_topic)):
+        for each in by_topic[entry.topic]:
+            each.add(entry)
 
-    def __init__(self, path: Path, topic: str, count: int) -> None:
-        self._path, self._topic, self._count = path, topic, count
-        self._messages: Iterator[bytes] | None = None
-        self._next, self._image = 0, b""
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_messages": None, "_next": 0, "_image": b""}
+def _frames(path: Path, camera: Camera, zero: int) -> ImageFrames:
+    stamp = f"{camera.topic} {file_stamp(path)}"
+    return ImageFrames(camera.images(path), (camera.times - zero) / 1e9, stamp=stamp)
 
-    def __len__(self) -> int:
-        return self._count
 
-    def __getitem__(self, index: Any) -> bytes:
-        if self._messages is None or index < self._next - 1:
-            self._messages, self._next = _pictures(self._path, self._topic), 0
-        while self._next <= index:
-            self._image = next(self._messages)
-            self._next += 1
-        return self._image
+def _name(topic: str) -> str:
+    return topic.strip("/").replace("/", ".")
 
 
 def _files(path: Path) -> list[Path]:
@@ -171,140 +164,18 @@ def _files(path: Path) -> list[Path]:
     return sorted(path.glob("*.mcap"), key=lambda each: natural(each.name))
 
 
-class _Json(DecoderFactory):
-    """Decodes messages in JSON."""
-
-    def decoder_for(self, message_encoding: str, schema: Any) -> Any:
-        return parse_json if message_encoding == "json" else None
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Generator[Any]:
-    """A reader of the file; what it finds wrong in the block becomes a `DataError`."""
-    try:
-        with path.open("rb") as file:
-            yield make_reader(file, decoder_factories=[_Json(), Ros2(), Protobuf()])
-    except DataError:
-        raise
-    except (McapError, OSError, ValueError, KeyError, EOFError, StopIteration) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"the log {path} cannot be read ({reason})") from error
-
-
-def _topics(path: Path) -> dict[str, str]:
-    """The kind of message of each topic."""
-    with _opened(path) as reader:
-        summary = reader.get_summary()
-        if summary is None or not summary.channels:
-            return {
-                channel.topic: schema.name if schema else ""
-                for schema, channel, _ in reader.iter_messages()
-            }
-        schemas = summary.schemas
-        return {
-            channel.topic: schemas[channel.schema_id].name if channel.schema_id else ""
-            for channel in summary.channels.values()
-        }
-
-
-def _times(path: Path, topic: str) -> NDArray[np.int64]:
-    with _opened(path) as reader:
-        found = [message.log_time for _, _, message in reader.iter_messages(topics=[topic])]
-    return np.array(found, np.int64)
-
-
-def _pictures(path: Path, topic: str) -> Iterator[bytes]:
-    with _opened(path) as reader:
-        for decoded in reader.iter_decoded_messages(topics=[topic]):
-            data = _field(decoded.decoded_message, "data")
-            if not _is_image(decoded.schema.name if decoded.schema else "") or data is None:
-                raise DataError(f"{topic} of {path} holds no compressed images")
-            yield base64.b64decode(data) if isinstance(data, str) else bytes(data)
-
-
-def _is_image(kind: str) -> bool:
-    return re.split(r"[./]", kind)[-1] == "CompressedImage"
-
-
-def _samples(path: Path, topic: str, zero: int) -> Samples:
-    _, times, rows = _numbers(path, topic)
-    return Samples(rows, (times - zero) / 1e9)
-
-
-def _numbers(path: Path, topic: str) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[Any]]:
-    """Names, times and values of a topic's numbers, or those of one field of it."""
-    where, _, field = topic.partition(":")
-    names: tuple[str, ...] = ()
-    times: list[int] = []
-    rows: list[list[float]] = []
-    with _opened(path) as reader:
-        for decoded in reader.iter_decoded_messages(topics=[where]):
-            found = dict(_leaves(decoded.decoded_message))
-            if field:
-                found = {n: v for n, v in found.items() if re.split(r"[.\[]", n)[0] == field}
-            names = names or tuple(found)
-            if tuple(found) != names or not names:
-                raise DataError(
-                    f"message {len(rows)} of {topic} in {path} holds {len(found)} numbers, the "
-                    f"first {len(names)}"
-                )
-            times.append(decoded.message.log_time)
-            rows.append([float(value) for value in found.values()])
-    if not rows:
-        raise DataError(f"{path} has no message of {topic}")
-    return names, np.array(times, np.int64), np.array(rows)
-
-
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers in a message, by their path in it."""
-    if isinstance(value, bool | int | float | np.number):
-        yield name, float(value)
-    elif isinstance(value, str | bytes) or value is None:
-        return
-    elif (fields := _fields(value)) is not None:
-        for field in fields:
-            if field not in UNNUMBERED:
-                yield from _leaves(_field(value, field), f"{name}.{field}".lstrip("."))
-    else:
-        for place, entry in enumerate(value):
-            yield from _leaves(entry, f"{name}[{place}]")
-
-
-def _fields(message: Any) -> list[str] | None:
-    """The names of the fields of a message in any encoding; None for a list."""
-    if isinstance(message, dict):
-        return list(message)
-    if hasattr(message, "DESCRIPTOR"):
-        return [field.name for field in message.DESCRIPTOR.fields]
-    slots = getattr(message, "__slots__", None)
-    return [slot for slot in slots if not slot.startswith("_")] if slots else None
-
-
-def _field(message: Any, name: str) -> Any:
-    return message.get(name) if isinstance(message, dict) else getattr(message, name, None)
-
-
-def _known(path: Path, topics: Sequence[str], kinds: dict[str, str]) -> tuple[str, ...]:
-    for topic in topics:
-        if topic not in kinds:
-            raise DataError(f"{path} has no topic {topic!r}{suggest(topic, kinds)}")
-    return tuple(topics)
-
-
-def _actions(path: Path, wanted: str | None, kinds: dict[str, str], images: list[str]) -> str:
-    """The topic of actions: the one that is wanted, or the only one with numbers."""
+def _actions(path: Path, wanted: str | None, others: Sequence[str]) -> tuple[str, Numbers]:
+    """The topic of actions, which is wanted or the only one with numbers, and its numbers."""
+    columns = {name: Column(name) for name in ([wanted] if wanted else others)}
+    _gathered(path, (), columns)
     if wanted:
-        return wanted
-    found: list[str] = []
-    for topic in kinds:
-        with contextlib.suppress(DataError):
-            if topic not in images and _numbers(path, topic):
-                found.append(topic)
+        return wanted, columns[wanted].numbers()
+    found = [name for name, each in columns.items() if each.rows and each.problem is None]
     if len(found) != 1:
         raise DataError(
             f"{path} has {len(found)} topics of numbers ({', '.join(found)}): give --actions TOPIC"
         )
-    return found[0]
+    return found[0], columns[found[0]].numbers()
 
 
 def _told(kinds: dict[str, str]) -> str:

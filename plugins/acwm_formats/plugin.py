@@ -66,7 +66,7 @@ def register_formats_of_arrays(registry: Registry) -> None:
     registry.add(
         "mcap",
         "acwm_formats.mcap_logs:MCAP",
-        summary="logs with compressed images and a topic of numbers; only read",
+        summary="logs with images or video and a topic of numbers; only read",
         extra="mcap",
         requires=("mcap", "mcap_ros2", "mcap_protobuf"),
     )

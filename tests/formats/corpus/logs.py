@@ -3,11 +3,15 @@
 import base64
 import io
 import json
+from fractions import Fraction
 
+import av
 import mcap.writer
+import numpy as np
 from mcap_ros2.writer import Writer as Ros2
 from PIL import Image
 
+from tests.formats.corpus.clips import FAST
 from tests.formats.corpus.pictures import depth, picture
 
 START = 1_700_000_000 * 10**9  # when the first frame was logged, in ns since 1970
@@ -100,3 +104,37 @@ def in_ros2(folder, case):
                     writer.write_message(topic, array, content, time, time)
             writer.finish()
     return folder, {}
+
+
+def coded(numbers, codec, size, options=(), pixels="yuv420p"):
+    """Pictures as the packets of a video, a key frame and three others, in the encoder's order."""
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt = size[1], size[0], pixels
+    encoder.time_base, encoder.framerate = Fraction(1, 10), Fraction(10)
+    encoder.gop_size, encoder.max_b_frames, encoder.thread_count = 4, 0, 1
+    encoder.options = {**FAST[codec], **dict(options)}
+    for place, number in enumerate(numbers):
+        image = np.ascontiguousarray(picture(number, size))
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts = place
+        yield from encoder.encode(frame)
+    yield from encoder.encode(None)
+
+
+def in_video(path, packets, times, rows, name):
+    """One log with a topic of Foxglove's CompressedVideo, and a row of actions at each time."""
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        kind = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
+        camera = writer.register_channel("/camera", "json", kind)
+        command = writer.register_channel(
+            "/command", "json", writer.register_schema("Command", "jsonschema", b"{}")
+        )
+        for packet, time, row in zip(packets, times, rows, strict=True):
+            data = base64.b64encode(packet).decode()
+            content = {"timestamp": {"sec": 7, "nsec": 7}, "format": name, "data": data}
+            at = START + round(time * 10**9)
+            writer.add_message(camera, at, json.dumps(content).encode(), at)
+            writer.add_message(command, at, json.dumps({"turn": row}).encode(), at)
+        writer.finish()

@@ -1,0 +1,203 @@
+"""Messages in MCAP files: topics, times and numbers in one scan, and messages one by one."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.decoder import DecoderFactory
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory as Protobuf
+from mcap_ros2.decoder import DecoderFactory as Ros2
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError
+from acwm_core.files import parse_json
+
+UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
+"""Fields of messages that hold no action."""
+
+
+class Numbers(NamedTuple):
+    """The numbers in the messages of a topic, or in one field of them.
+
+    Attributes:
+        names: one per column.
+        times: ``[N]`` when each message was logged, in ns.
+        rows: ``[N, len(names)]``.
+    """
+
+    names: tuple[str, ...]
+    times: NDArray[np.int64]
+    rows: NDArray[np.float64]
+
+
+class Entry(NamedTuple):
+    """A message of one of the topics that were asked for.
+
+    Attributes:
+        topic: where it was logged.
+        kind: the name of its schema.
+        time: when it was logged, in ns.
+        content: decodes it; raises a `DataError` if it cannot.
+    """
+
+    topic: str
+    kind: str
+    time: int
+    content: Callable[[], Any]
+
+
+class _Json(DecoderFactory):
+    """Decodes messages in JSON."""
+
+    def decoder_for(self, message_encoding: str, schema: Any) -> Any:
+        return parse_json if message_encoding == "json" else None
+
+
+def topics(path: Path) -> dict[str, str]:
+    """The kind of message of each topic.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    with _opened(path) as reader:
+        summary = reader.get_summary()
+        if summary is None or not summary.channels:
+            found = reader.iter_messages()
+            return {channel.topic: schema.name if schema else "" for schema, channel, _ in found}
+        schemas = summary.schemas
+        return {
+            channel.topic: schemas[channel.schema_id].name if channel.schema_id else ""
+            for channel in summary.channels.values()
+        }
+
+
+def entries(path: Path, wanted: Sequence[str]) -> Iterator[Entry]:
+    """The messages of some topics, in the order in which they were logged.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    factories = (_Json(), Ros2(), Protobuf())
+    decoders: dict[int, Any] = {}
+    with _opened(path) as reader:
+        for schema, channel, message in reader.iter_messages(topics=list(wanted)):
+            if channel.id not in decoders:
+                made = (each.decoder_for(channel.message_encoding, schema) for each in factories)
+                decoders[channel.id] = next((each for each in made if each), None)
+            decode = _decoding(path, channel, decoders[channel.id], message.data)
+            yield Entry(channel.topic, schema.name if schema else "", message.log_time, decode)
+
+
+def _decoding(path: Path, channel: Any, decoder: Any, data: bytes) -> Callable[[], Any]:
+    def content() -> Any:
+        what = f"a message of {channel.topic} in {path}"
+        if decoder is None:
+            raise DataError(f"{what} is in {channel.message_encoding}, which cannot be decoded")
+        try:
+            return decoder(data)
+        except Exception as error:  # every encoding has its own exceptions
+            raise DataError(f"{what} is damaged ({type(error).__name__}: {error})") from error
+
+    return content
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Generator[Any]:
+    """A reader of the file; what it finds wrong in the block becomes a `DataError`."""
+    try:
+        with path.open("rb") as file:
+            yield make_reader(file)
+    except DataError:
+        raise
+    except (McapError, OSError, ValueError, KeyError, EOFError, StopIteration) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DataError(f"the log {path} cannot be read ({reason})") from error
+
+
+@dataclass
+class Column:
+    """Gathers the numbers of a topic, or of one field of it: ``TOPIC`` or ``TOPIC:FIELD``."""
+
+    name: str
+    names: tuple[str, ...] = ()
+    times: list[int] = field(default_factory=list[int])
+    rows: list[list[float]] = field(default_factory=list[list[float]])
+    problem: DataError | None = None
+
+    @property
+    def topic(self) -> str:
+        """Where its messages were logged."""
+        return self.name.partition(":")[0]
+
+    def add(self, entry: Entry) -> None:
+        """Add the numbers of a message; what is wrong with it is told by `numbers`."""
+        if self.problem is None:
+            try:
+                self._add(entry)
+            except DataError as error:
+                self.problem = error
+
+    def _add(self, entry: Entry) -> None:
+        found, asked = dict(_leaves(entry.content())), self.name.partition(":")[2]
+        if asked:
+            found = {n: v for n, v in found.items() if re.split(r"[.\[]", n)[0] == asked}
+        if not found:
+            raise DataError(f"message {len(self.rows)} of {self.name} holds no numbers")
+        self.names = self.names or tuple(found)
+        if tuple(found) != self.names:
+            raise DataError(
+                f"message {len(self.rows)} of {self.name} holds {len(found)} numbers, the first "
+                f"{len(self.names)}"
+            )
+        self.times.append(entry.time)
+        self.rows.append(list(found.values()))
+
+    def numbers(self) -> Numbers:
+        """What was gathered.
+
+        Raises:
+            DataError: there are no messages, or not all hold the same numbers.
+        """
+        if self.problem is not None:
+            raise self.problem
+        if not self.rows:
+            raise DataError(f"there is no message of {self.name}")
+        return Numbers(self.names, np.array(self.times, np.int64), np.array(self.rows))
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers in a message, by their path in it."""
+    if isinstance(value, bool | int | float | np.number):
+        yield name, float(value)
+    elif isinstance(value, str | bytes) or value is None:
+        return
+    elif (fields := _fields(value)) is not None:
+        for each in fields:
+            if each not in UNNUMBERED:
+                yield from _leaves(content_of(value, each), f"{name}.{each}".lstrip("."))
+    else:
+        for place, entry in enumerate(value):
+            yield from _leaves(entry, f"{name}[{place}]")
+
+
+def _fields(message: Any) -> list[str] | None:
+    """The names of the fields of a message in any encoding; None for a list."""
+    if isinstance(message, dict):
+        return list(message)
+    if hasattr(message, "DESCRIPTOR"):
+        return [field.name for field in message.DESCRIPTOR.fields]
+    slots = getattr(message, "__slots__", None)
+    return [slot for slot in slots if not slot.startswith("_")] if slots else None
+
+
+def content_of(message: Any, name: str) -> Any:
+    """A field of a message in any encoding; None if it has none of that name."""
+    return message.get(name) if isinstance(message, dict) else getattr(message, name, None)
