@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any, Literal
 
 import gymnasium
@@ -52,12 +53,12 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frames, dict[str, Any]]:
         """Start an episode."""
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else operator.index(seed))
         start = self._dreams.start(self.np_random, options or {})
         result = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])
         self._steps, self._frame = 0, result.frames[0]
         info = self._info(result)
-        return self._frame, info if start.goal is None else {**info, "goal": start.goal}
+        return self._frame.copy(), info if start.goal is None else {**info, "goal": start.goal}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Frames, float, bool, bool, dict[str, Any]]:
         """Predict one latent frame under one action.
@@ -72,11 +73,11 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         self._steps, self._frame = self._steps + 1, result.frames[0]
         over = self._steps >= self._dreams.max_steps
         reward, success = float(result.rewards[0]), bool(result.success[0])
-        return self._frame, reward, success, over, self._info(result)
+        return self._frame.copy(), reward, success, over, self._info(result)
 
     def render(self) -> Frames:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
-        return self._frame
+        return self._frame.copy()
 
     def close(self) -> None:
         """Free all resources."""

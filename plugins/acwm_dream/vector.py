@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -33,7 +35,10 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
         self.num_envs = num_envs
         self._dreams = Dreams(settings_of(settings), num_envs)
         card, self.repeat = self._dreams.card, self._dreams.repeat
-        self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_fps": card.fps}
+        self.metadata = {
+            "autoreset_mode": AutoresetMode.NEXT_STEP,
+            "render_fps": card.fps / self.repeat,
+        }
         self.single_observation_space, self.single_action_space = spaces_of(self._dreams)
         batched = gymnasium.vector.utils.batch_space
         self.observation_space = batched(self.single_observation_space, num_envs)
@@ -53,14 +58,17 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
 
         Options are those of `Dream.reset`, and apply to all episodes.
         """
-        if isinstance(seed, int):
-            seed = [seed + place for place in range(self.num_envs)]
-        seeds = seed or [None] * self.num_envs
+        if seed is None:
+            seeds: Sequence[int | None] = [None] * self.num_envs
+        elif isinstance(seed, Sequence):
+            seeds = seed
+        else:
+            seeds = [operator.index(seed) + place for place in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise RecipeError(f"{len(seeds)} seeds for {self.num_envs} environments")
         for place, each in enumerate(seeds):
             if each is not None:
-                self._rngs[place] = np_random(each)[0]
+                self._rngs[place] = np_random(operator.index(each))[0]
         info: dict[str, Any] = {}
         self._over = np.zeros(self.num_envs, np.bool_)
         self._begin(list(range(self.num_envs)), options or {}, info)

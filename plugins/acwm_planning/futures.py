@@ -71,7 +71,7 @@ class ModelFutures(Futures):
         before: the latent frames up to now, `[N, K, C, h, w]`.
         last: index, within the last latent frame, of the last planned video frame.
         estimator: reads states from frames, if there is one.
-        stills: cache of the latent frames of pictures, by their `id`; shared within a decision.
+        stills: pictures and their latent frames, encoded before; shared within a decision.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ModelFutures(Futures):
         before: Latent,
         last: int,
         estimator: StateEstimator | None,
-        stills: dict[int, Latent],
+        stills: list[tuple[Frame, Latent]],
     ) -> None:
         self._codec, self._latents, self._before = codec, latents, before
         self._last, self._estimator, self._stills = last, estimator, stills
@@ -134,9 +134,12 @@ class ModelFutures(Futures):
 
     def still(self, picture: Frame) -> Latent:
         """Each picture is encoded once per decision."""
-        if id(picture) not in self._stills:
-            self._stills[id(picture)] = still_latent(self._codec, picture)
-        return self._stills[id(picture)]
+        for known, latent in self._stills:
+            if known is picture:
+                return latent
+        latent = still_latent(self._codec, picture)
+        self._stills.append((picture, latent))
+        return latent
 
 
 class ModelRollouts:
@@ -183,7 +186,7 @@ class ModelRollouts:
             seed: seed of the model's noise.
         """
         given, recent = self._encode(history, still)
-        stills: dict[int, Latent] = {}
+        stills: list[tuple[Frame, Latent]] = []
 
         def cost(actions: Actions) -> Tensor:
             costs: list[Tensor] = []
@@ -226,7 +229,7 @@ class ModelRollouts:
         recent: Tensor,
         actions: Actions,
         seed: int,
-        stills: dict[int, Latent],
+        stills: list[tuple[Frame, Latent]],
     ) -> ModelFutures:
         with torch.set_grad_enabled(actions.requires_grad):
             latents = self._predict(given, recent, actions, seed)

@@ -151,7 +151,11 @@ def test_episodes_can_be_dreamt_again(run):
 
     first = played(3)
     assert not np.array_equal(first, played(4))
-    assert np.array_equal(first, played(3))
+    assert np.array_equal(first, played(np.int64(3)))
+    seen = env.step(actions(1, 5)[0])[0]
+    env.render()[:] = 0  # what was returned is the caller's
+    assert np.array_equal(env.render(), seen)
+    assert seen.any()
 
 
 def held_bytes():

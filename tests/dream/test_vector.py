@@ -73,6 +73,11 @@ def test_spaces_and_seeds(run):
     other, _ = many.reset(seed=[4, 5])
     assert np.array_equal(other[0], same[0])
     assert not np.array_equal(other[1], same[1])
+    for seed in (0, 3):
+        number, _ = many.reset(seed=seed)
+        assert np.array_equal(many.reset(seed=np.int64(seed))[0], number)
+    one = gymnasium.make("acwm/dream-v0", run=run, device="cpu")
+    assert many.unwrapped.metadata["render_fps"] == one.metadata["render_fps"]
     spec, _ = many.reset(options={"spec": tiny.spec(0)})
     assert np.array_equal(spec[0], spec[1])
     kept = spec.copy()

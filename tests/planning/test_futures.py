@@ -210,3 +210,13 @@ def test_the_goal_is_encoded_once_for_a_decision(bundle, history, monkeypatch):
     assert (len(stills), len(encoded)) == (4, 1)
     still = frame_of(goal)[:, None].expand(-1, 3, -1, -1, -1)
     torch.testing.assert_close(stills[-1], bundle.world_model.encode(still)[:, -1:])
+
+
+def test_pictures_made_on_the_fly_are_not_taken_for_each_other(bundle, history):
+    (futures,) = seen(
+        ModelRollouts(bundle.world_model, bundle.card, None), history, candidates(1, 4)
+    )
+    for shade in range(0, 250, 25):  # each is freed, and the next one takes its place in memory
+        found = futures.still(np.full_like(history.frames[0], shade))
+        still = frame_of(np.full_like(history.frames[0], shade))[:, None].expand(-1, 3, -1, -1, -1)
+        torch.testing.assert_close(found, bundle.world_model.encode(still)[:, -1:])
