@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import av
 import numpy as np
 from av.error import FFmpegError
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
@@ -98,28 +99,35 @@ class VideoFrames:
         index = video_index(self.path)
         wanted = index.ticks[self.first : self.stop][np.asarray(indices, np.int64)].tolist()
         frames, shown, image = _decoded(self.path, wanted[0]), None, np.zeros(0, np.uint8)
+        reformatter = VideoReformatter()  # shared, as its setup takes longer than a frame
         for tick in wanted:
             while shown is None or shown < tick:
                 frame = next(frames, None)
                 if frame is None:
                     raise DataError(f"the video {self.path} ends before {_at(index, tick)}")
                 if frame.pts is not None and frame.pts >= tick:
-                    shown, image = frame.pts, self._pixels(frame, index, depth_range)
+                    shown = frame.pts
+                    image = self._pixels(frame, index, depth_range, reformatter)
             if shown != tick:
                 raise DataError(f"the video {self.path} has no frame {_at(index, tick)}")
             yield image
 
     def _pixels(
-        self, frame: Any, index: VideoIndex, depth_range: tuple[float, float] | None
+        self,
+        frame: Any,
+        index: VideoIndex,
+        depth_range: tuple[float, float] | None,
+        reformatter: VideoReformatter,
     ) -> NDArray[np.uint8]:
         if index.depth:
             metres = frame.to_ndarray().astype(np.float32) * self.unit
             image = to_rgb(metres, depth_range=depth_range)
             return np.ascontiguousarray(np.rot90(image, index.turns))
         size = index.size if index.turns % 2 == 0 else index.size[::-1]
-        shape = {} if size == (frame.height, frame.width) else {"height": size[0], "width": size[1]}
         clear = any(component.is_alpha for component in frame.format.components)
-        image = to_rgb(frame.to_ndarray(format="rgba" if clear else "rgb24", **shape))
+        kind = "rgba" if clear else "rgb24"
+        shown = reformatter.reformat(frame, format=kind, height=size[0], width=size[1])
+        image = to_rgb(shown.to_ndarray())
         return np.ascontiguousarray(np.rot90(image, index.turns)) if index.turns else image
 
 

@@ -97,10 +97,9 @@ def _staged(task: StageTask, recording: TimedRecording, episode: PlannedEpisode)
         return path.name
     frames, count = reading.frames(recording, episode), len(episode.actions)
     height, width = reading.size[0], reading.size[1] * len(reading.cameras)
-    blank = np.zeros((height, width), np.uint8)
     members = {
         "video.mkv": encode_frames(frames, (height, width), VIDEO, task.fps, KEYFRAMES),
-        "mask.mkv": encode_frames([blank] * count, (height, width), MASK, task.fps, count),
+        "mask.mkv": _no_masks(count, (height, width), task.fps),
         "actions.npy": to_npy(episode.actions),
         "states.npz": to_npz(episode.states),
         "contacts.npy": to_npy(np.zeros((0, 3), np.int32)),
@@ -110,6 +109,11 @@ def _staged(task: StageTask, recording: TimedRecording, episode: PlannedEpisode)
         for name, data in members.items():
             archive.writestr(name, data)
     return path.name
+
+
+@functools.lru_cache(maxsize=64)  # most recordings are of a few lengths
+def _no_masks(count: int, size: tuple[int, int], fps: float) -> bytes:
+    return encode_frames([np.zeros(size, np.uint8)] * count, size, MASK, fps, count)
 
 
 @dataclass(frozen=True)
