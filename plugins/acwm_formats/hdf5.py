@@ -29,7 +29,7 @@ from acwm_formats.hdf5_layouts import (
 )
 from acwm_formats.hdf5_recordings import HDF5Recordings
 from acwm_formats.names import exact, pair, typed, word, words
-from acwm_formats.timeline import ActionFacts, RecordedDataset, Recordings
+from acwm_formats.timeline import ActionFacts, RecordedDataset, Recordings, first_sound
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
@@ -43,7 +43,7 @@ class HDF5(Format):
         files = files_of(path)
         if not files:
             return False
-        with opened(files[0]) as file:
+        with opened(first_sound(files, _closed)) as file:
             return layout_of(file) is not None
 
     def read(
@@ -74,17 +74,16 @@ class HDF5(Format):
         files = files_of(root)
         if not files:
             raise DataError(f"{root} is no HDF5 file and holds none")
-        layout = _layout(files[0], video, actions, states)
+        first = first_sound(files, _closed)
+        layout = _layout(first, video, actions, states)
         if rate is None and layout.rate is None:
-            raise DataError(
-                f"{files[0]} does not say how many frames it has per second: give --rate"
-            )
+            raise DataError(f"{first} does not say how many frames it has per second: give --rate")
         stated = exact(rate) if rate else cast(Fraction, layout.rate)
         reader = functools.partial(
             HDF5Recordings, layout=layout, rate=stated, pixel_range=pair(pixel_range)
         )
         options = {"video": video, "actions": actions, "states": states, "rate": rate}
-        card = _card(files[0]) if layout.name == "acwm" else None
+        card = _card(first) if layout.name == "acwm" else None
         return RecordedDataset(
             name=card.name if card else word(root),
             splits=_splits(files, layout, reader),
@@ -161,21 +160,35 @@ def _splits(
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
     found: dict[Split | None, list[tuple[Path, str]]] = {}
+    damaged: list[tuple[Path, str]] = []
     for path in files:
-        with opened(path) as file:
-            names, tests = episodes_in(file, layout), _tests(file)
-            own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
-            for name in names:
-                split = cast(
-                    Split | None, own or (tests and tests.get(name.split("/")[-1], "train"))
-                )
-                found.setdefault(split, []).append((path, name))
+        try:
+            names, tests = _contents(path, layout)
+        except DataError:
+            damaged.append((path, "/"))  # opening it will tell why
+            continue
+        own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
+        for name in names:
+            split = cast(Split | None, own or (tests and tests.get(name.split("/")[-1], "train")))
+            found.setdefault(split, []).append((path, name))
+    if damaged and found:
+        found.setdefault(None if None in found else "train", []).extend(damaged)
     if not found:
         what = " and ".join((layout.actions, *layout.cameras.values()))
         raise DataError(f"{files[0]} has no group with {what}")
     if None in found:
         return reader(dict(enumerate(place for places in found.values() for place in places)))
     return {split: reader(dict(enumerate(places))) for split, places in found.items() if split}
+
+
+def _contents(path: Path, layout: Layout) -> tuple[list[str], dict[str, Split] | None]:
+    """The groups of episodes in a file, and those that it sets aside for tests."""
+    with opened(path) as file:
+        return episodes_in(file, layout), _tests(file)
+
+
+def _closed(path: Path) -> None:
+    opened(path).close()
 
 
 def _tests(file: Any) -> dict[str, Split] | None:

@@ -66,6 +66,7 @@ def opened(path: Path) -> Any:
     outside: list[str] = []
     file.visititems_links(lambda name, link: _external(name, link, outside))
     if outside:
+        file.close()
         raise DataError(f"{path} has a link to another file, {outside[0]}: copy what it names")
     return file
 

@@ -20,7 +20,13 @@ from acwm_formats.frames import ImageFrames, file_stamp
 from acwm_formats.mcap_images import Camera, is_image, is_video
 from acwm_formats.mcap_messages import Column, Numbers, entries, topics
 from acwm_formats.names import natural, word, words
-from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
+from acwm_formats.timeline import (
+    ActionFacts,
+    RecordedDataset,
+    Samples,
+    TimedRecording,
+    first_sound,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -71,7 +77,8 @@ class MCAP(Format):
         files = _files(root)
         if not files:
             raise DataError(f"{root} is no MCAP file and holds none")
-        first, kinds = files[0], topics(files[0])
+        first = first_sound(files, topics)
+        kinds = topics(first)
         filmed = [topic for topic, kind in kinds.items() if is_image(kind) or is_video(kind)]
         cameras = words(video) or tuple(filmed)
         if not cameras:

@@ -7,6 +7,7 @@ import itertools
 import json
 import shlex
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -46,6 +47,7 @@ UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
 MOST_TOLD = 50  # notes and defects that are told one by one
 ROWS = 1_000_000  # about how many rows of actions are looked at for their bounds
 AT_ONCE = 64  # recordings that one task looks at
+MOST_TOGETHER = 16  # recordings that one task decodes, if there are thousands
 
 Parts = Mapping[Split, tuple[Recordings, Sequence[int]]]
 """The recordings of each split, and the places in them of those that belong to it."""
@@ -94,8 +96,9 @@ def import_dataset(
     """Write recordings as the data folder `out`.
 
     All recordings are looked at and decoded before anything is refused, so that all defects are in
-    one list. What was decoded is kept, so the same call goes on where a killed one ended, and so
-    does one with other options or after a file was removed.
+    one list; those that are known without decoding are told at once, too. What was decoded is kept,
+    so the same call goes on where a killed one ended, and so does one with other options or after a
+    file was removed.
 
     Args:
         recorded: what a format read, e.g. ``LeRobot().read(root)``.
@@ -157,6 +160,8 @@ class _Import:
         bad = {(each.split, each.index): [*each.defects] for each in scans if each.defects}
         for each in scans:
             bad.setdefault((each.split, each.index), []).extend(self._of_another_rate(each, fps))
+        if self.progress:
+            self._tell([defect for defects in bad.values() for defect in defects])
         plan = self._plan(scans, fps)
         staging = self.out / STAGING
         if not staging.exists() and (self.out / CARD).exists():
@@ -173,6 +178,17 @@ class _Import:
             made = self._filled(card, kept)
         shutil.rmtree(staging, ignore_errors=True)
         return made
+
+    def _tell(self, defects: Sequence[Defect]) -> None:
+        """Tell defects as soon as they are known, since decoding may take hours."""
+        if defects:
+            end = {
+                "refuse": "the others are decoded to find theirs, and kept for the next import",
+                "skip": "these recordings are left out",
+                "trim": "their sound parts are kept",
+            }[self.options.alignment.on_defect]
+            lines = "\n".join(f"  {line}" for line in _few([str(each) for each in defects]))
+            print(f"found without decoding ({end}):\n{lines}", file=sys.stderr, flush=True)
 
     def _looked_at(self) -> list[Scan]:
         total = sum(len(places) for _, places in self.parts.values())
@@ -258,7 +274,8 @@ class _Import:
             for index in places
             if (split, index) not in bad or self.options.alignment.on_defect == "trim"
         ]
-        for _, part in itertools.groupby(wanted, lambda index: index // self.recorded.together):
+        together = max(self.recorded.together, min(MOST_TOGETHER, len(places) // 256))
+        for _, part in itertools.groupby(wanted, lambda index: index // together):
             yield tuple(part)
 
     def _sound(

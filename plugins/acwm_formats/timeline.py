@@ -8,9 +8,10 @@ and states are brought together is decided in one place, `acwm_formats.alignment
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -227,3 +228,20 @@ class RecordedDataset:
     summary: str = ""
     engine: str = "recorded"
     citation: str = ""
+
+
+def first_sound(paths: Sequence[Path], opens: Callable[[Path], object]) -> Path:
+    """The first of some files that can be opened; the others become defects of their recordings.
+
+    Raises:
+        DataError: none can be; that of the first.
+    """
+    problem: DataError | None = None
+    for path in paths:
+        try:
+            opens(path)
+        except DataError as error:
+            problem = problem or error
+        else:
+            return path
+    raise problem or DataError("there are no files")

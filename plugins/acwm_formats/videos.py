@@ -31,7 +31,14 @@ from acwm_formats.tables import (
     seconds,
     special_column,
 )
-from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
+from acwm_formats.timeline import (
+    ActionFacts,
+    Frames,
+    RecordedDataset,
+    Samples,
+    TimedRecording,
+    first_sound,
+)
 
 VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".gif")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -116,10 +123,11 @@ class Videos(Format):
         if not places:
             raise DataError(f"{root} holds no video and no folder of pictures")
         table = _shared(root, places, actions)
-        path = table or next((place.table for place in places if place.table), None)
-        if path is None:
+        tables = [table] if table else [place.table for place in places if place.table]
+        if not tables:
             endings = ", ".join(ending[1:] for ending in READERS)
             raise DataError(f"{root} has no table of actions beside {places[0].name}: {endings}")
+        path = first_sound(tables, read_table)
         chosen = _columns(path, words(columns), words(states), time, shared=table is not None)
         options = {"actions": actions, "columns": columns, "states": states, "time": time}
         options |= {"rate": rate, "from_first_row": from_first_row}
