@@ -154,6 +154,8 @@ class Codec(nn.Module, ABC):
         shape = list(video.shape)
         if video.ndim != 5 or shape[2] != 3 or shape[1] < 1:
             raise ShapeError(f"a codec encodes video [B, T, 3, H, W], not {shape}")
+        if not video.is_floating_point():
+            raise ShapeError(f"a codec encodes floats in [0, 1], not {video.dtype}: divide by 255")
         if shape[3] % self.spatial_stride or shape[4] % self.spatial_stride:
             raise ShapeError(
                 f"{type(self).__name__} needs frame sides that are multiples of "

@@ -1,4 +1,4 @@
-"""YAML as people expect it: 1e-4 is a number, a date is text, a duplicate key is an error."""
+"""YAML 1.2, as people expect it: 1e-4 is a number, a date is text; a duplicate key is an error."""
 
 from __future__ import annotations
 
@@ -56,14 +56,31 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
 
 _Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
 
-_RESOLVERS = {
-    start: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
-    for start, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+_CORE_SCHEMA = {
+    "merge": r"<<",
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
+"""What is not text if it is not quoted: YAML 1.2.2, 10.3.2, and ``<<``. In YAML 1.1, which PyYAML
+reads by itself, 010 is 8, 12:30 is 750 and no is false."""
+
+_Loader.yaml_implicit_resolvers = {}
+_Dumper.yaml_implicit_resolvers = {
+    start: [*pairs] for start, pairs in yaml.SafeDumper.yaml_implicit_resolvers.items()
+}  # text that YAML 1.1 would read as something else is quoted, too
 for _class in (_Loader, _Dumper):
-    _class.yaml_implicit_resolvers = {start: [*pairs] for start, pairs in _RESOLVERS.items()}
-    _class.add_implicit_resolver(  # pyright: ignore[reportUnknownMemberType]
-        "tag:yaml.org,2002:float",
-        re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
-        list("-+.0123456789"),
-    )
+    for _name, _pattern in _CORE_SCHEMA.items():
+        _class.add_implicit_resolver(  # pyright: ignore[reportUnknownMemberType]
+            f"tag:yaml.org,2002:{_name}", re.compile(f"(?:{_pattern})$"), None
+        )
+
+
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    text = str(loader.construct_scalar(node))
+    return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)

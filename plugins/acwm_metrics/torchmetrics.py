@@ -21,6 +21,7 @@ from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError
 from acwm_core.evaluation.metric import Metric, Prediction, SetMetric
+from acwm_core.model.shapes import check_pixels
 from acwm_core.plugins import catalog
 from acwm_core.recipe.metrics import own_name
 
@@ -186,9 +187,12 @@ class RolloutMetric(torchmetrics.Metric):
             episodes: the true episode of each clip, for metrics that read states.
 
         Raises:
-            ShapeError: the two differ in shape, or there is not one episode per clip.
+            ShapeError: the two differ in shape, or there is not one episode per clip, or frames are
+                not float in [0, 1].
             PluginError: the metric cannot be measured on such frames.
         """
+        for clip in (prediction, target):
+            check_pixels(clip)
         pairs = [clip if clip.ndim == 5 else clip[None] for clip in (prediction, target)]
         known = [None] * len(pairs[1]) if episodes is None else episodes
         if not len(pairs[0]) == len(pairs[1]) == len(known):

@@ -52,7 +52,7 @@ def plan(
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
     """
-    from acwm_planning.settings import ROW_NAMES, settings_of
+    from acwm_planning.settings import ROW_NAMES, settings_of, words_of
 
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)
@@ -60,7 +60,12 @@ def plan(
     from acwm_core.executors import progress_bar
     from acwm_planning.run import declared_settings, plan_episodes
 
-    settings = settings_of(overrides, preset, declared_settings(run, task))
+    declared = declared_settings(run, task)
+    settings = settings_of(overrides, preset, declared)
+    effective = list(words_of(settings.to_dict()))
+    click.echo(f"settings: {' '.join(effective)}")
+    if other := [word for word in declared if word not in effective]:
+        click.echo(f"not as the task declares: {' '.join(other)}")
     if compare and settings.differentiates and not rows:
         click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
         rows = tuple(row for row in ROW_NAMES if row not in ("simulator", "codec"))

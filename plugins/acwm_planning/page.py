@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from jinja2 import Environment, select_autoescape
 
 from acwm_core.files import writing, written_whole
-from acwm_core.recipe.types import show
-from acwm_planning.settings import ROW_NAMES
+from acwm_planning.settings import ROW_NAMES, words_of
 from acwm_planning.table import HEADS, VIDEOS, RowSummary
 
 PAGE_FILE = "index.html"
@@ -63,22 +62,9 @@ def write_page(
             name = f"{VIDEOS}/{file.name}"
             videos.append({"file": name, "row": row, "seed": seed, "panels": panels})
     template = Environment(autoescape=select_autoescape(default=True)).from_string(_TEMPLATE)
-    words = " ".join(_words(settings))
+    words = " ".join(words_of(settings))
     text = template.render(title=title, settings=words, heads=HEADS, rows=rows, videos=videos)
     page = folder / PAGE_FILE
     with writing(page), written_whole(page) as partial:
         partial.write_text(text, encoding="utf-8")
     return page
-
-
-def _words(settings: Mapping[str, Any]) -> Iterator[str]:
-    """The settings as overrides of `acwm plan`, and the first digits of the weights' hash."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            params = dict(cast(Mapping[str, Any], value))
-            yield f"{name}={params.pop('name')}"
-            yield from (f"{name}.{each}={show(v)}" for each, v in params.items())
-        elif name == "weights" and value is not None:
-            yield f"weights={str(value)[:12]}"
-        elif name not in ("environment", "task") and value is not None:  # those are in the title
-            yield f"{name}={value}"

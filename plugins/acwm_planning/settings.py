@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, get_type_hints
+from typing import Any, cast, get_type_hints
 
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.recipe.check import check_component
 from acwm_core.recipe.compose import parse_override
-from acwm_core.recipe.types import checked
+from acwm_core.recipe.types import checked, show
 
 ROW_NAMES = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 """What chooses the actions: the planner with the model; the same planner with the true simulator;
@@ -99,8 +99,8 @@ def settings_of(
         overrides: e.g. ``planner=cem``, ``planner.candidates=300``, ``cost.frames=1``, ``past=2``;
             their order does not matter.
         preset: one of `PRESETS`.
-        declared: overrides of the task (`Task.planning`). They apply to the default preset only,
-            and before `overrides`.
+        declared: overrides of the task (`Task.planning`). They apply before those of another preset
+            than the default, and before `overrides`.
 
     Raises:
         RecipeError: a preset, component or parameter does not exist, or a value is wrong.
@@ -111,8 +111,8 @@ def settings_of(
     plain: dict[str, Any] = {}
     types = get_type_hints(Settings)
     known = [each.name for each in fields(Settings)]
-    own = declared if preset == "default" else ()
-    for words in (PRESETS[preset], own, overrides):
+    chosen = PRESETS[preset] if preset != "default" else ()
+    for words in (PRESETS["default"], declared, chosen, overrides):
         parsed = [parse_override(word) for word in words]
         # names first: a new name drops the parameters of the previous component
         for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
@@ -127,3 +127,16 @@ def settings_of(
                     components[name] = {"name": value}
     checked_choices = {name: check_component(name, choice) for name, choice in components.items()}
     return Settings(**checked_choices, **plain)
+
+
+def words_of(settings: Mapping[str, Any]) -> Iterator[str]:
+    """The settings as overrides of `acwm plan`, and the first digits of the weights' hash."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            params = dict(cast(Mapping[str, Any], value))
+            yield f"{name}={params.pop('name')}"
+            yield from (f"{name}.{each}={show(v)}" for each, v in params.items())
+        elif name == "weights" and value is not None:
+            yield f"weights={str(value)[:12]}"
+        elif name not in ("environment", "task") and value is not None:  # those are in the title
+            yield f"{name}={value}"

@@ -159,5 +159,8 @@ def test_clips_that_do_not_belong_together_are_refused():
     prediction, target = videos()
     with pytest.raises(ShapeError, match="4 predicted clips, 5 true ones and 5 episodes"):
         as_torchmetric("mse").update(prediction[:4], target)
+    for wrong in ((target * 255).byte(), target * 2 - 1):
+        with pytest.raises(ShapeError, match=r"255|in \[0, 1\]"):
+            as_torchmetric("ssim").update(wrong, wrong)
     with pytest.raises(PluginError, match="lpips cannot be measured: it needs weights"):
         as_torchmetric("lpips").update(prediction, target)

@@ -100,8 +100,10 @@ def test_settings_that_a_task_declares_come_before_those_of_the_user():
     named = settings_of(["planner=cem", "cost=latent"], declared=declared)
     assert (named.planner["name"], named.cost["name"]) == ("cem", "latent")
     assert named.planner["candidates"] == 128  # another planner has its own defaults
-    pure = settings_of([], "stable_worldmodel", declared)
-    assert pure == settings_of([], "stable_worldmodel")
+    preset = settings_of([], "stable_worldmodel", declared)
+    assert preset == settings_of(
+        ["past=1"], "stable_worldmodel"
+    )  # of which the preset says nothing
 
 
 def test_the_page_shows_settings_that_make_the_same_plans_again(tmp_path):
@@ -115,9 +117,12 @@ def test_the_page_shows_settings_that_make_the_same_plans_again(tmp_path):
 def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
     monkeypatch.setattr(tiny.PLACE, "planning", ("cost=state", "planner.horizon=2"), raising=False)
     words = ["plan", mine, "place", "--row", "still", "--videos", "0"]
-    assert acwm(capsys, *words)[0] == 0
+    code, told, _ = acwm(capsys, *words, "cost=latent")
+    assert code == 0
     found = json.loads((mine / "planning/place/settings.json").read_text())
-    assert (found["cost"]["name"], found["planner"]["horizon"]) == ("state", 2)
+    assert (found["cost"]["name"], found["planner"]["horizon"]) == ("latent", 2)
+    assert "planner.horizon=2" in told.splitlines()[0]
+    assert told.splitlines()[1] == "not as the task declares: cost=state"
 
 
 def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):

@@ -1,11 +1,14 @@
 """Files, `extends` and words to one dict."""
 
+import math
 from pathlib import Path
 
 import pytest
+import yaml
 
 from acwm_core.errors import RecipeError
 from acwm_core.recipe.compose import merge, parse_override, read_recipe
+from acwm_core.recipe.text import dump, parse
 
 
 @pytest.fixture
@@ -70,12 +73,41 @@ def test_words_do_not_depend_on_their_order(folder: Path) -> None:
         ("objective.shift={a: 1}", {"a": 1}),
         ("objective.shift=2024-01-01", "2024-01-01"),
         ("objective.shift=a=b", "a=b"),
+        ("objective.shift=010", 10),  # in YAML 1.1: 8
+        ("objective.shift=0o10", 8),
+        ("objective.shift=12:30", "12:30"),  # 750
+        ("objective.shift=10:00:00:00", "10:00:00:00"),
+        ("objective.shift=no", "no"),  # false
         ("objective.shift='1e-4'", "1e-4"),
         ("objective.shift=", None),
     ],
 )
 def test_values_of_words_are_yaml(word: str, expected: object) -> None:
     assert parse_override(word) == {"objective": {"shift": expected}}
+
+
+def test_what_is_written_is_read_back_by_both_versions_of_yaml() -> None:
+    texts = [
+        "010",
+        "12:30",
+        "yes",
+        "no",
+        "on",
+        "0o17",
+        "1e4",
+        "1_0",
+        "~",
+        "=",
+        "<<",
+        "0x1f",
+        "0b1",
+        ".inf",
+        "2026-01-01",
+        "null",
+    ]
+    values = {"texts": [*texts, ""], "numbers": [10, -1, 1e-7, 1.5, 1e300, math.inf], "truth": True}
+    assert parse(dump(values), "text") == values
+    assert yaml.safe_load(dump(values)) == values
 
 
 def test_a_part_may_be_written_out_in_a_word() -> None:
