@@ -168,6 +168,7 @@ class MetricInfo:
     reads: Reads = "states"
     factor: float | None = None
     rank: int = 100
+    definition: int = 1
 
 
 class Metric(ABC):
@@ -188,6 +189,7 @@ class Metric(ABC):
         rank: its order in tables, lowest first; the metric with the lowest rank orders the clips.
         of_branches: whether it compares a clip with its branches. It is then measured only on the
             clips of the counterfactual test (`evaluation.counterfactual_metrics`).
+        definition: number of its definition; scores of different ones do not compare.
     """
 
     name: str
@@ -200,12 +202,13 @@ class Metric(ABC):
     factor: float | None = None
     rank: int = 100
     of_branches: bool = False
+    definition: int = 1
 
     @property
     def info(self) -> MetricInfo:
         """What tables and charts need to know about it."""
         title = self.title or self.name.replace("_", " ").capitalize()
-        shown = self.group, self.reads, self.factor, self.rank
+        shown = self.group, self.reads, self.factor, self.rank, self.definition
         return MetricInfo(self.unit, self.higher_is_better, title, *shown)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
@@ -241,6 +244,17 @@ class Metric(ABC):
     def weight(self, prediction: Prediction) -> float:
         """Weight of the clip in `summarise`; 1 unless overridden."""
         return 1.0
+
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the clip that is scored by what is seen in it, in [0, 1]; NaN if there is none.
+
+        By default it is the share of frames with a defined score. A metric that scores what it does
+        not find, for example where it was last seen, gives the share that it finds.
+
+        Args:
+            curve: the result of `curve` for the clip.
+        """
+        return float((~np.isnan(curve)).mean())
 
     def curve(self, prediction: Prediction) -> NDArray[np.float64]:
         """Call `per_frame`; `PluginError` unless the result has one number per frame."""

@@ -41,6 +41,8 @@ class Score:
             as they are written.
         features: features `[2, D]` of each `SetMetric`.
         failed: whether the prediction is not finite; then all scores are `Metric.worst`.
+        shares: `Metric.coverage` of each metric that reads states; none in results of older
+            versions.
     """
 
     split: str
@@ -54,6 +56,7 @@ class Score:
     curves: dict[str, list[float]]
     features: dict[str, list[list[float]]] = field(default_factory=dict[str, list[list[float]]])
     failed: bool = False
+    shares: dict[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class SetSummary:
         paired: the model against ``copy`` and ``shuffled``, by reference and metric.
         failed: number of predictions that were not finite, by row; each gets the worst score.
         undefined: number of the model's clips without a score, by metric; they are left out.
+        shares: mean of `Score.shares` over clips, by row and metric; empty in older results.
     """
 
     clips: int
@@ -75,6 +79,7 @@ class SetSummary:
     episodes: int = 0
     failed: dict[str, int] = field(default_factory=dict[str, int])
     undefined: dict[str, int] = field(default_factory=dict[str, int])
+    shares: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
     def failures(self, row: str = "model") -> str:
         """``3 of 12 predictions are not finite``; empty if all are finite."""

@@ -150,6 +150,9 @@ def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
                 curve = np.full(frames, metric.worst) if scored.failed else metric.curve(part)
                 scored.values[name], scored.weights[name] = metric.scored(part, curve)
                 scored.curves[name] = curve.astype(np.float32).tolist()
+                if metric.reads == "states":
+                    seen = 0.0 if scored.failed else metric.coverage(shown, curve)
+                    scored.shares[name] = float(seen)
                 if isinstance(metric, SetMetric) and not scored.failed:
                     features = np.asarray(metric.features(part))
                     check_shape(metric, "features", features, 2, -1)

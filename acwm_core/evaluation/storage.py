@@ -34,7 +34,7 @@ PLACE = {
 }
 """Types of the Parquet columns that identify the clip and row of the scores."""
 
-CURVE, WEIGHT, FEATURES = "_per_frame", "_weight", "_features"
+CURVE, WEIGHT, FEATURES, SHARE = "_per_frame", "_weight", "_features", "_share"
 """Suffixes of a metric's further Parquet columns, beside the one with its values."""
 
 WITHOUT_EFFECT = ("batch_size", "device")
@@ -45,7 +45,7 @@ OF_SWEEPS = ("severity_episodes",)
 
 
 def write_scores(path: Path, scores: Sequence[Score]) -> None:
-    """Write one Parquet row per score, with the value, weight and curve of each metric."""
+    """Write one Parquet row per score, with value, weight, curve and share of each metric."""
     columns: dict[str, Any] = {
         name: pa.array([getattr(s, name) for s in scores], kind)
         for name, kind in {**PLACE, "failed": pa.bool_()}.items()
@@ -56,6 +56,8 @@ def write_scores(path: Path, scores: Sequence[Score]) -> None:
             name + WEIGHT: pa.array([s.weights[name] for s in scores], pa.float64()),
             name + CURVE: pa.array([s.curves[name] for s in scores], pa.list_(pa.float32())),
         }
+    for name in dict.fromkeys(name for s in scores for name in s.shares):
+        columns[name + SHARE] = pa.array([s.shares.get(name) for s in scores], pa.float64())
     for name in dict.fromkeys(name for s in scores for name in s.features):
         vectors = [s.features.get(name) for s in scores]
         columns[name + FEATURES] = pa.array(vectors, pa.list_(pa.list_(pa.float32())))
@@ -100,6 +102,7 @@ def _score(row: Mapping[str, Any], names: Sequence[str]) -> Score:
         curves={name: row[name + CURVE] for name in names},
         features={n: row[n + FEATURES] for n in names if row.get(n + FEATURES)},
         failed=row.get("failed", False),
+        shares={n: row[n + SHARE] for n in names if row.get(n + SHARE) is not None},
     )
 
 

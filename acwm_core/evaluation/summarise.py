@@ -63,8 +63,24 @@ def summarise(results: Sequence[Score], metrics: Metrics, seed: int) -> SetSumma
     }
     left_out = {name: count for name, count in undefined.items() if count}
     return SetSummary(
-        len(model), rows, paired, len({r.episode for r in model}), dict(failed), left_out
+        clips=len(model),
+        rows=rows,
+        paired=paired,
+        episodes=len({r.episode for r in model}),
+        failed=dict(failed),
+        undefined=left_out,
+        shares={kind: shares([r for r in results if r.kind == kind]) for kind in table},
     )
+
+
+def shares(row: Sequence[Score]) -> dict[str, float]:
+    """The mean share that is scored of the clips of a row, by metric; see `Metric.coverage`."""
+    found: dict[str, list[float]] = {}
+    for score in row:
+        for name, share in score.shares.items():
+            found.setdefault(name, []).append(share)
+    known = {name: [x for x in each if not math.isnan(x)] for name, each in found.items()}
+    return {name: float(np.mean(each)) for name, each in known.items() if each}
 
 
 def steps_curve(sweep: Mapping[int, Sequence[Score]], metrics: Metrics, seed: int) -> StepsCurve:

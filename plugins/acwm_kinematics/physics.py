@@ -99,7 +99,7 @@ ROBOT_ARM = Physics(
 REACHER = Physics(
     readings=(
         Reading("elbow_position", "position", ("upper_arm",)),
-        Reading("fingertip_position", "position", ("fingertip",)),
+        Reading("fingertip_position", "position", ("forearm",)),  # its end
         Reading("joint_angle", "angle", ("upper_arm", "forearm")),
     ),
     objects=("base", "upper_arm", "forearm", "fingertip", "goal"),

@@ -25,8 +25,9 @@ from acwm_core.evaluation.metric import Prediction
 from acwm_core.plugins import catalog
 from acwm_metrics.conservation import LASTING, change
 from acwm_metrics.contact import beginnings, matched, true_contacts
-from acwm_metrics.physical import measured, physics_of
+from acwm_metrics.physical import physics_of
 from acwm_metrics.presence import out_of_sight, seen_once
+from acwm_metrics.seen import measured
 
 MARGIN = 1.2
 """Factor between a tolerance and the largest error on the calibration videos."""

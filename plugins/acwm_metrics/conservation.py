@@ -6,18 +6,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from acwm_core.env.physics import Constant, Physics
 from acwm_core.evaluation.metric import Prediction
-from acwm_metrics.physical import (
-    PhysicalMetric,
-    measured,
-    physics_of,
-    row_means,
-    start_of,
-    truth_of,
-)
+from acwm_metrics.physical import PhysicalMetric, physics_of, row_means, start_of, truth_of
 from acwm_metrics.presence import out_of_sight, seen_once
+from acwm_metrics.seen import lost_shapes, measured, share_found
 
 LASTING = 3
 """Frames in a row for which solid bodies must overlap, so that it is not just an estimator error.
@@ -27,11 +22,13 @@ For other violations, see `Constant.lasting` and `Physics.lasting`."""
 class Permanence(PhysicalMetric):
     """Share of the frames in which every object is there exactly once.
 
-    An object may be hidden behind another, but must not vanish, split, double or appear from
-    nowhere.
+    An object may be hidden behind another where the true video had something by then, too, but must
+    not vanish, split, double or appear from nowhere. What hardly differs from its surroundings is
+    not there.
     """
 
     name = "permanence"
+    definition = 2
     bounds = (0.0, 1.0)
     higher_is_better = True
 
@@ -47,10 +44,12 @@ class LengthError(PhysicalMetric):
     """Relative error of fixed lengths, those of links and ropes.
 
     They are compared with the lengths in the episode, not with the true video at the same time,
-    because they hold for any predicted motion.
+    because they hold for any predicted motion. A length that is not found counts as 0, so its error
+    is 1.
     """
 
     name = "length_error"
+    definition = 2
     kind: Literal["length", "amount"] = "length"
 
     def lacking(self, physics: Physics) -> str | None:
@@ -61,18 +60,32 @@ class LengthError(PhysicalMetric):
         constants = _of(physics_of(prediction), self.kind)
         return row_means(np.abs(np.stack([change(each, prediction) for each in constants], 1)))
 
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the frames and lengths that are found, of those that the true video shows."""
+        constants = _of(physics_of(prediction), self.kind)
+        return 1 - float(np.mean([lost(each, prediction) for each in constants]))
+
 
 class AmountError(LengthError):
-    """Relative error of the amount of water or sand."""
+    """Relative error of the amount of water or sand.
+
+    In frames without any that is found, though the true video shows some, the error is 1.
+    """
 
     name = "amount_error"
     kind = "amount"
 
 
 class Penetration(PhysicalMetric):
-    """Depth by which solid bodies overlap, the largest of all pairs."""
+    """Depth by which solid bodies overlap where they meet, the largest of all pairs.
+
+    They meet in the frames in which they overlap, or almost do: their distance is below what the
+    estimator's error can make an overlap. If bodies never meet, nothing is measured. A body that is
+    not found stays where it was last seen, so others may run into it.
+    """
 
     name = "penetration"
+    definition = 2
     unit = "m"
 
     def lacking(self, physics: Physics) -> str | None:
@@ -80,11 +93,16 @@ class Penetration(PhysicalMetric):
         return None if solid else "no two solid bodies whose distance is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
-        """The depth in each frame, `[T]`, in m; 0 where nothing overlaps."""
-        gaps = [gap for gap in physics_of(prediction).gaps if gap.solid is not None]
-        depths = np.stack([-measured(gap, prediction) for gap in gaps], 1)
+        """The depth in each frame in which bodies meet, `[T]`, in m; 0 where nothing overlaps."""
+        gaps = [(gap, gap.solid) for gap in physics_of(prediction).gaps if gap.solid is not None]
+        depths = np.stack([-measured(gap, prediction, held=True) for gap, _ in gaps], 1)
+        meeting = (depths > [-solid for _, solid in gaps]).any(1)
         deepest = np.where(np.isnan(depths), -np.inf, depths).max(1)
-        return np.where(np.isnan(depths).all(1), np.nan, np.maximum(deepest, 0.0))
+        return np.where(meeting, np.maximum(deepest, 0.0), np.nan)
+
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the bodies and frames in which a state is found."""
+        return share_found(prediction, physics_of(prediction).readings)
 
 
 class Violations(PhysicalMetric):
@@ -98,6 +116,7 @@ class Violations(PhysicalMetric):
     """
 
     name = "violations"
+    definition = 2
     bounds = (0.0, 1.0)
 
     def lacking(self, physics: Physics) -> str | None:
@@ -147,13 +166,29 @@ def repeats_first_frame(prediction: Prediction) -> bool:
 
 
 def change(constant: Constant, prediction: Prediction) -> NDArray[np.float64]:
-    """The relative error of a constant in each frame of the prediction, `[T]`.
+    """The relative error of a constant in each frame of the prediction, `[T]`; −1 if it is lost.
 
     It is relative to the median of the true values, because elastic things stretch a little.
     """
-    true = constant.measure(truth_of(prediction), start_of(prediction))
+    true = _true(constant, prediction)
     true = true[np.isfinite(true)]
-    return measured(constant, prediction) / (np.median(true) if len(true) else np.nan) - 1
+    relative = measured(constant, prediction) / (np.median(true) if len(true) else np.nan) - 1
+    return np.where(lost(constant, prediction), -1.0, relative)
+
+
+def lost(constant: Constant, prediction: Prediction) -> NDArray[np.bool_]:
+    """Whether a constant cannot be measured in a frame in which it can be in the truth, `[T]`.
+
+    It must be measurable just before and after, too, because there an estimator may err by one.
+    """
+    there = np.isfinite(_true(constant, prediction))
+    there = np.asarray(ndimage.minimum_filter(there.astype(np.uint8), 3, mode="nearest"), np.bool_)
+    gone = np.isnan(measured(constant, prediction))
+    return there & (gone | lost_shapes(prediction) if constant.kind == "amount" else gone)
+
+
+def _true(constant: Constant, prediction: Prediction) -> NDArray[np.float64]:
+    return constant.measure(truth_of(prediction), start_of(prediction))
 
 
 def lasting(flags: NDArray[np.bool_], frames: float = LASTING) -> NDArray[np.bool_]:

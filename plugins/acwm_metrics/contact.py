@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from acwm_core.env.physics import Gap, Physics
 from acwm_core.evaluation.metric import Prediction
-from acwm_metrics.physical import PhysicalMetric, instance_id, measured, physics_of
+from acwm_metrics.physical import PhysicalMetric, instance_id, physics_of
+from acwm_metrics.seen import measured, share_found, shown
 
 WINDOW = 5
 """Largest difference in frames between the onsets of two contacts that count as the same."""
@@ -27,11 +28,13 @@ class Onsets:
         seen: frames of onsets in the prediction.
         true: frames of onsets in truth.
         pairs: matching onsets, as (index in `seen`, index in `true`).
+        lost: frames of true onsets without a match of which a body is not found then.
     """
 
     seen: NDArray[np.int64]
     true: NDArray[np.int64]
     pairs: list[tuple[int, int]]
+    lost: NDArray[np.int64]
 
 
 class ContactMetric(PhysicalMetric):
@@ -39,11 +42,13 @@ class ContactMetric(PhysicalMetric):
 
     An event is the onset of a contact: two bodies touch that did not touch in the frames before. A
     contact in frame 0 is not an event. In the prediction, bodies touch where their distance, as
-    read by the estimator, is below a threshold. Clips are weighted by their number of events, so
+    read by the estimator, is below a threshold. A body that is not found touches nothing: it misses
+    its contacts, and each counts as the worst. Clips are weighted by their number of events, so
     the summary is the mean over all events of all clips.
     """
 
     group = "Contacts"
+    definition = 2
 
     def lacking(self, physics: Physics) -> str | None:
         told = any(gap.touch is not None for gap in physics.gaps)
@@ -65,6 +70,10 @@ class ContactMetric(PhysicalMetric):
         """The number of events."""
         return float(len(self._events(prediction)[1]))
 
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the bodies and frames in which a state is found."""
+        return share_found(prediction, physics_of(prediction).readings)
+
     def _events(self, prediction: Prediction) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Frames and scores of all events."""
         found = [(f, s) for each in onsets(prediction) for f, s in self._scored(each, prediction)]
@@ -76,7 +85,10 @@ class ContactMetric(PhysicalMetric):
 
 
 class ContactPrecision(ContactMetric):
-    """Share of the predicted contacts that happen in truth, within 5 frames."""
+    """Share of the predicted contacts that happen in truth, within 5 frames.
+
+    A true contact of a body that is not found then counts as a wrong one.
+    """
 
     name = "contact_precision"
     bounds = (0.0, 1.0)
@@ -84,7 +96,8 @@ class ContactPrecision(ContactMetric):
 
     def _scored(self, onsets: Onsets, prediction: Prediction) -> Iterator[tuple[int, float]]:
         right = {seen for seen, _ in onsets.pairs}
-        return ((int(f), float(k in right)) for k, f in enumerate(onsets.seen))
+        yield from ((int(f), float(k in right)) for k, f in enumerate(onsets.seen))
+        yield from ((int(f), 0.0) for f in onsets.lost)
 
 
 class ContactRecall(ContactMetric):
@@ -100,7 +113,10 @@ class ContactRecall(ContactMetric):
 
 
 class ContactTiming(ContactMetric):
-    """How much too early or too late correctly predicted contacts begin."""
+    """How much too early or too late correctly predicted contacts begin.
+
+    A true contact of a body that is not found then counts as 5 frames off.
+    """
 
     name = "contact_timing"
     unit = "s"
@@ -109,6 +125,7 @@ class ContactTiming(ContactMetric):
         for seen, true in onsets.pairs:
             off = abs(int(onsets.seen[seen]) - int(onsets.true[true]))
             yield int(onsets.true[true]), off * self._frame(prediction)
+        yield from ((int(f), WINDOW * self._frame(prediction)) for f in onsets.lost)
 
     def _frame(self, prediction: Prediction) -> float:
         return 1 / prediction.card.fps
@@ -133,9 +150,19 @@ def _onsets(prediction: Prediction) -> Iterator[Onsets]:
     for gap in physics_of(prediction).gaps:
         if gap.touch is None:
             continue
-        seen = beginnings(measured(gap, prediction) < gap.touch)
+        distance = measured(gap, prediction)
+        seen = beginnings(distance < gap.touch)
         true = beginnings(true_contacts(prediction, gap))
-        yield Onsets(seen, true, matched(seen, true))
+        pairs = matched(seen, true)
+        missed = np.delete(true, [place for _, place in pairs])
+        unseen = np.isnan(distance) & shown(prediction, _bodies(prediction, gap)).all(1)
+        yield Onsets(seen, true, pairs, missed[unseen[missed]])
+
+
+def _bodies(prediction: Prediction, gap: Gap) -> list[str]:
+    """The instances of a pair whose states are read; others, as walls, stay where they are."""
+    read = {name for each in physics_of(prediction).readings for name in each.instances}
+    return [name for name in gap.pair if name in read]
 
 
 def true_contacts(prediction: Prediction, gap: Gap) -> NDArray[np.bool_]:

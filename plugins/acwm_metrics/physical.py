@@ -5,14 +5,28 @@ from __future__ import annotations
 import math
 import warnings
 from abc import abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.physics import Constant, Gap, Level, Observation, Physics, StateEstimator, States
+from acwm_core.env.physics import (
+    Observation,
+    Physics,
+    StateEstimator,
+    States,
+)
 from acwm_core.errors import PluginError
 from acwm_core.evaluation.metric import Metric, Prediction
+
+MIN_AREA = 5e-4
+"""Share of the frame below which an instance is too small to judge: 2 pixels of 64 × 64."""
+
+MIN_SHARE = 0.2
+"""Share of an object's usual area below which it counts as not seen, and a part as no part."""
+
+Mask = NDArray[np.bool_]
 
 
 class PhysicalMetric(Metric):
@@ -58,15 +72,27 @@ def start_of(prediction: Prediction) -> States:
     return {name: values[0] for name, values in prediction.states.items()}
 
 
-def measured(quantity: Constant | Gap | Level, prediction: Prediction) -> NDArray[np.float64]:
-    """A quantity in each frame of the prediction; see `Measure`."""
-    key = ("measured", quantity.measure)
-    return prediction.once(key, lambda: quantity.measure(prediction.observed, start_of(prediction)))
-
-
 def instance_id(prediction: Prediction, name: str) -> int:
     """The id of an instance in masks and contacts."""
     return prediction.card.instances.index(name)
+
+
+def ids_of(prediction: Prediction, names: Sequence[str]) -> NDArray[np.int64]:
+    """The ids of instances, `[n]`."""
+    return np.array([instance_id(prediction, name) for name in names], np.int64)
+
+
+def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of pixels of each instance in each frame, `[T, n]`."""
+    frames = len(masks)
+    keys = np.arange(frames)[:, None, None] * 256 + masks
+    return np.bincount(keys.ravel(), minlength=frames * 256).reshape(frames, 256)[:, ids]
+
+
+def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The median area of instances over the frames that show them, `[n]`; 0 without any."""
+    areas = counts(masks, ids)
+    return np.array([np.median(a[a > 0]) if a.any() else 0.0 for a in areas.T])
 
 
 def row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:

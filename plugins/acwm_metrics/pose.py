@@ -10,24 +10,32 @@ from numpy.typing import NDArray
 
 from acwm_core.env.physics import Physics, Reading, Symmetry
 from acwm_core.evaluation.metric import Prediction
-from acwm_metrics.physical import (
-    PhysicalMetric,
-    physics_of,
-    row_means,
-)
+from acwm_metrics.physical import PhysicalMetric, physics_of, row_means
+from acwm_metrics.seen import exist, held_of, seen_of, share_found, shown
 
 PERIODS = {"none": 2 * np.pi, "half_turn": np.pi, "quarter_turn": np.pi / 2}
 """Period of an angle by symmetry, in rad."""
+
+LARGEST = {
+    "none": np.pi,
+    "half_turn": np.pi / 2,
+    "quarter_turn": np.pi / 4,
+    "box": 2 * np.pi / 3,
+    "cube": 2 * np.arccos((1 + 2**0.5) / 8**0.5),
+}
+"""The largest angle between two orientations of a body, by symmetry, in rad."""
 
 
 class PositionError(PhysicalMetric):
     """Distance of bodies from their true positions, mean over bodies.
 
-    The distance of a rope is the mean over its points, counted from the end that fits better.
-    Bodies that are not seen have no position and are left out: see `mask_iou` and `permanence`.
+    The distance of a rope is the mean over its points, counted from the end that fits better. A
+    body that is not found, though the true video shows it, counts at its last seen place. One that
+    neither shows is left out.
     """
 
     name = "position_error"
+    definition = 2
     unit = "m"
     group = "States"
 
@@ -38,14 +46,22 @@ class PositionError(PhysicalMetric):
         """The distance in each frame, `[T]`, in m."""
         return _mean_over_rows(prediction, _of(physics_of(prediction), "position", "curve"))
 
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the bodies and frames in which a place is found."""
+        return share_found(prediction, _of(physics_of(prediction), "position", "curve"))
+
 
 class OrientationError(PhysicalMetric):
     """Angle between predicted and true orientations of bodies, mean over bodies.
 
-    Orientations that look the same, as of a cube, count as equal: the nearest one is used.
+    Orientations that look the same, as of a cube, count as equal: the nearest one is used. A body
+    that is not found, though the true video shows it, counts with the largest angle there can be:
+    its last orientation could be better than a true one that is late. One that neither shows is
+    left out.
     """
 
     name = "orientation_error"
+    definition = 2
     unit = "rad"
     group = "States"
 
@@ -55,6 +71,10 @@ class OrientationError(PhysicalMetric):
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The angle in each frame, `[T]`, in rad."""
         return _mean_over_rows(prediction, _of(physics_of(prediction), "angle", "quaternion"))
+
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the bodies and frames in which an orientation is found."""
+        return share_found(prediction, _of(physics_of(prediction), "angle", "quaternion"))
 
 
 class PixelPositionError(PositionError):
@@ -81,24 +101,28 @@ def _mean_over_rows(
 
 
 def _errors(prediction: Prediction, reading: Reading, in_pixels: bool) -> NDArray[np.float64]:
-    """Error of each row of a reading, `[T, n]`; NaN for rows that do not exist."""
-    seen, true = reading.of(prediction.observed.states), reading.of(prediction.states)
+    """Error of each row of a reading, `[T, n]`; NaN for rows that do not exist or nobody sees."""
+    seen, true = reading.of(held_of(prediction).states), reading.of(prediction.states)
     if in_pixels and prediction.estimator is not None:
         seen, true = (prediction.estimator.pixels(reading.field, each) for each in (seen, true))
     if reading.kind == "curve":
         ways = [np.linalg.norm(seen - each, axis=-1).mean(1) for each in (true, true[:, ::-1])]
         return np.minimum(*ways)[:, None]
-    if reading.kind == "angle":
-        errors = angle_between(seen, true, reading.symmetry)
-    elif reading.kind == "quaternion":
-        errors = turn_between(seen, true, reading.symmetry)
+    if reading.kind in ("angle", "quaternion"):
+        errors = _turned(prediction, reading)
     else:
         errors = np.linalg.norm(seen - true, axis=-1)
     errors = errors.reshape(len(errors), -1)
-    if reading.present:
-        there = np.asarray(prediction.states[reading.present]).reshape(errors.shape) > 0
-        errors = np.where(there, errors, np.nan)
-    return errors
+    return np.where(exist(prediction, reading), errors, np.nan) if reading.present else errors
+
+
+def _turned(prediction: Prediction, reading: Reading) -> NDArray[np.float64]:
+    """Angle to the true orientation of each body, `[T, n]`; the largest one if it is not found."""
+    seen, true = reading.of(seen_of(prediction).states), reading.of(prediction.states)
+    between = angle_between if reading.kind == "angle" else turn_between
+    errors = between(seen, true, reading.symmetry).reshape(len(seen), -1)
+    lost = np.isnan(errors) & shown(prediction, reading.instances)
+    return np.where(lost, LARGEST[reading.symmetry], errors)
 
 
 def angle_between(

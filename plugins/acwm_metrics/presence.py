@@ -9,19 +9,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from acwm_core.evaluation.metric import Prediction
-from acwm_metrics.physical import instance_id, physics_of
-from acwm_metrics.shape import counts
-
-MIN_SHARE = 0.2
-"""Share of an object's usual area below which it counts as not seen, and a part as no part."""
+from acwm_metrics.physical import MIN_SHARE, Mask, counts, ids_of, physics_of, usual_sizes
+from acwm_metrics.seen import seen_of
 
 COVERED = 0.3
 """Share of an object's last seen area that others must cover for it to count as hidden."""
 
 MOSTLY = 0.5
 """Only objects last seen with less than this share of their area can be carried out of sight."""
-
-Mask = NDArray[np.bool_]
 
 _NEIGHBOURS = np.ones((3, 3), np.int64)
 _IN_FRAME = np.stack([0 * _NEIGHBOURS, _NEIGHBOURS, 0 * _NEIGHBOURS])
@@ -38,11 +33,12 @@ def presence(prediction: Prediction) -> dict[str, Mask]:
     """Whether each object is correctly present or absent in each frame, `[T]`, by name.
 
     An object of the episode must be seen in one piece, unless something is in front of it or it
-    extends beyond the frame. An object that the episode does not have must not be seen.
+    extends beyond the frame. What is in front of it must also be there in the true video. An object
+    that the episode does not have must not be seen.
     """
-    physics, masks = physics_of(prediction), prediction.observed.masks
+    physics, masks = physics_of(prediction), seen_of(prediction).masks
     ids, areas, sizes = _areas(prediction)
-    before = np.array([*ids, *(instance_id(prediction, name) for name in physics.shapes)])
+    before = np.array([*ids, *ids_of(prediction, physics.shapes)])
     exist = sizes > 0
     least = MIN_SHARE * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
     movable = {name for reading in physics.readings for name in reading.instances}
@@ -51,11 +47,12 @@ def presence(prediction: Prediction) -> dict[str, Mask]:
         seen = areas[:, k] >= least[k]
         if exist[k]:
             others = before[before != instance]
-            first = prediction.masks[0] == instance
-            found[name] = seen | hidden(masks, int(instance), seen, others, first)
+            found[name] = seen | hidden(masks, prediction.masks, int(instance), seen, others)
             if name in movable:
                 much = MOSTLY * float(sizes[k])
-                found[name] |= carried(masks, int(instance), seen, others, much)
+                gone = counts(prediction.masks, ids[k : k + 1])[:, 0] < least[k]
+                gone = np.logical_or.accumulate(gone)  # by then; a prediction may be late
+                found[name] |= gone & carried(masks, int(instance), seen, others, much)
             found[name] &= pieces(masks, int(instance), others, float(least[k])) <= 1
         else:
             found[name] = ~seen
@@ -72,45 +69,40 @@ def _areas(
     prediction: Prediction,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Ids `[n]` of all objects, their areas in the prediction `[T, n]`, and usual areas `[n]`."""
-    names = physics_of(prediction).objects
-    ids = np.array([instance_id(prediction, name) for name in names])
+    ids = ids_of(prediction, physics_of(prediction).objects)
     return prediction.once(
         _areas,
-        lambda: (ids, counts(prediction.observed.masks, ids), usual_sizes(prediction.masks, ids)),
+        lambda: (ids, counts(seen_of(prediction).masks, ids), usual_sizes(prediction.masks, ids)),
     )
-
-
-def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The median area of instances over the frames that show them, `[n]`; 0 without any."""
-    areas = counts(masks, ids)
-    return np.array([np.median(a[a > 0]) if a.any() else 0.0 for a in areas.T])
 
 
 def hidden(
     masks: NDArray[np.uint8],
+    true: NDArray[np.uint8],
     instance: int,
     seen: Mask,
     others: NDArray[np.int64],
-    first: Mask,
 ) -> Mask:
     """Whether something is in front of an object that is not seen, `[T]`.
 
     This is the case if it lies where the object was last seen, or next to the object's visible
-    rest.
+    rest. The true video must have had something there by then, too: nothing is hidden by what was
+    made up.
 
     Args:
         masks: instance ids, `[T, H, W]`.
+        true: those of the true video.
         instance: id of the object.
         seen: whether enough of it is seen, `[T]`.
         others: ids of all that may be in front of it.
-        first: true mask of the object in the first frame, `[H, W]`.
     """
-    found, last = np.zeros(len(masks), np.bool_), first
+    found, last = np.zeros(len(masks), np.bool_), true[0] == instance
+    lawful = np.logical_or.accumulate(np.isin(true, others))
     for frame in np.flatnonzero(~seen):
         earlier = np.flatnonzero(seen[:frame])
         if len(earlier):
             last = masks[earlier[-1]] == instance
-        cover = np.isin(masks[frame], others)
+        cover = np.isin(masks[frame], others) & lawful[frame]
         left = np.asarray(ndimage.maximum_filter(masks[frame] == instance, 3), np.bool_)
         found[frame] = (cover & left).any() or cover[last].sum() >= COVERED * last.sum()
     return found

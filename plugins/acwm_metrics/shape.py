@@ -10,17 +10,16 @@ from scipy.spatial import KDTree
 from acwm_core.env.physics import Physics
 from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import (
+    MIN_AREA,
     PhysicalMetric,
-    instance_id,
-    measured,
+    counts,
+    ids_of,
     physics_of,
     row_means,
     start_of,
     truth_of,
 )
-
-MIN_AREA = 5e-4
-"""Share of the frame below which an instance is too small to judge: 2 pixels of 64 × 64."""
+from acwm_metrics.seen import last_seen, lost_shapes, measured, seen_of, shown
 
 
 class MaskIoU(PhysicalMetric):
@@ -43,7 +42,7 @@ class MaskIoU(PhysicalMetric):
         """IoU of each frame, `[T]`, in [0, 1]."""
         physics = physics_of(prediction)
         names = dict.fromkeys((*physics.objects, *physics.shapes))
-        ids = np.array([instance_id(prediction, name) for name in names])
+        ids = ids_of(prediction, [*names])
         seen, true = prediction.observed.masks, prediction.masks
         both = counts(np.where(seen == true, seen, 0), ids)
         either = counts(seen, ids) + counts(true, ids) - both
@@ -55,10 +54,12 @@ class OutlineError(PhysicalMetric):
     """Distance between predicted and true outlines of things without a pose, such as a rope.
 
     It is the mean distance in pixels from the points of each outline to the other outline, mean
-    over the instances that both show.
+    over the instances that the true video shows. One that is not found counts with the outline in
+    which it was last seen.
     """
 
     name = "outline_error"
+    definition = 2
     unit = "px"
     group = "States"
 
@@ -67,20 +68,31 @@ class OutlineError(PhysicalMetric):
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in pixels."""
-        ids = [instance_id(prediction, name) for name in physics_of(prediction).shapes]
-        pairs = zip(prediction.observed.masks, prediction.masks, strict=True)
-        errors = [[_apart(seen == i, true == i) for i in ids] for seen, true in pairs]
-        return row_means(np.array(errors))
+        names = physics_of(prediction).shapes
+        ids, there = ids_of(prediction, names), shown(prediction, names)
+        own = seen_of(prediction).masks[:, None] == ids[:, None, None]
+        true = prediction.masks[:, None] == ids[:, None, None]
+        missing = own.sum((2, 3)) < MIN_AREA * own[0, 0].size
+        held = last_seen(own, missing, true[0])
+        own = np.where((missing & there)[..., None, None], held, own)
+        pairs = zip(own, true, strict=True)
+        return row_means(np.array([list(map(_apart, *each)) for each in pairs]))
+
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the frames in which all of it is found that the true video shows."""
+        return float(1 - lost_shapes(prediction).mean())
 
 
 class HeightError(PhysicalMetric):
     """Error of the height of sand or water, mean over places.
 
     For sand, the places are the cells of a height map of the table. For water, it is the height at
-    which the water in the container would stand at rest.
+    which the water in the container would stand at rest. In frames without the sand or water that
+    the true video shows, its last seen height counts.
     """
 
     name = "height_error"
+    definition = 2
     unit = "m"
     group = "States"
 
@@ -90,18 +102,18 @@ class HeightError(PhysicalMetric):
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The error in each frame, `[T]`, in m."""
         true, start = truth_of(prediction), start_of(prediction)
-        errors = [
-            np.abs(measured(level, prediction) - level.measure(true, start))
-            for level in physics_of(prediction).levels
-        ]
+        lost, errors = lost_shapes(prediction), list[NDArray[np.float64]]()
+        for level in physics_of(prediction).levels:
+            seen, right = measured(level, prediction), level.measure(true, start)
+            if lost.any():
+                missing = np.broadcast_to(lost[:, None], seen.shape)
+                seen = np.where(missing, last_seen(seen, missing, right[0]), seen)
+            errors.append(np.abs(seen - right))
         return row_means(np.concatenate(errors, axis=1))
 
-
-def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of pixels of each instance in each frame, `[T, n]`."""
-    frames = len(masks)
-    keys = np.arange(frames)[:, None, None] * 256 + masks
-    return np.bincount(keys.ravel(), minlength=frames * 256).reshape(frames, 256)[:, ids]
+    def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
+        """Share of the frames in which all of it is found that the true video shows."""
+        return float(1 - lost_shapes(prediction).mean())
 
 
 def _apart(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:

@@ -118,6 +118,7 @@ def compare_runs(
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
     rows = dict(zip(summaries, map(_model_rows, folders), strict=True))
     metrics_of = {name: first.metrics[name] for name in names}
+    warnings += _definitions(summaries, names)
     found = [
         difference
         for split in chosen
@@ -200,6 +201,14 @@ def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
         if len(set(map(repr, facts.values()))) > 1:
             warnings.append(f"{what} differ: " + ", ".join(f"{k} {v}" for k, v in facts.items()))
     return warnings
+
+
+def _definitions(summaries: Mapping[str, Summary], names: Sequence[str]) -> list[str]:
+    """A warning if metrics had other definitions when some of the runs were evaluated."""
+    found = {name: {each.metrics[name].definition for each in summaries.values()} for name in names}
+    changed = [name for name, numbers in found.items() if len(numbers) > 1]
+    remedy = "evaluate all runs with this version of acwm"
+    return [f"definitions of {', '.join(changed)} differ: {remedy}"] if changed else []
 
 
 def checksums(summary: Summary) -> dict[str, str]:

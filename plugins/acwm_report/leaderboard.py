@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,7 +14,13 @@ from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
 from acwm_report.page import write_page
 from acwm_report.run import DAMAGE, described
-from acwm_report.scores import ScoreGrid, compared_metrics, failures, model_scores
+from acwm_report.scores import (
+    ScoreGrid,
+    compared_metrics,
+    failures,
+    model_scores,
+    scored_shares,
+)
 from acwm_report.table import Cell, Column, Row, Table
 from acwm_report.titles import clips_title, split_title
 from acwm_report.uses import Use, use_table, uses_of
@@ -149,11 +155,15 @@ def _table(entries: Mapping[str, Summary], name: str) -> Table:
     grid = ScoreGrid.of(models, metrics)
     facts = ("Model", "Parameters", "Trained", "Sampling", "Weights")
     rows = [
-        Row(name, [*grid.cells(scores), *_facts(summary)], ", ".join(failures(summary)))
+        Row(name, [*grid.cells(scores), *_facts(summary)], ", ".join(_remarks(summary, metrics)))
         for (name, summary), scores in zip(ranked.items(), models, strict=True)
     ]
     clips = [f"{split_title(s)}: {clips_title(each.scores)}" for s, each in first.splits.items()]
     return Table(", ".join(clips), [*grid.columns(), *map(Column, facts)], rows, "Run", name=name)
+
+
+def _remarks(summary: Summary, metrics: Iterable[str]) -> list[str]:
+    return [*failures(summary), *scored_shares(summary, metrics)]
 
 
 def _facts(summary: Summary) -> list[Cell]:

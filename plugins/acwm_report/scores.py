@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from acwm_core.evaluation.protocol import PublishedRow
@@ -88,6 +88,17 @@ def failures(summary: Summary) -> list[str]:
     """A phrase for each split in which predictions of the model are not finite."""
     found = {s: each.scores.failures() for s, each in summary.splits.items()}
     return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
+
+
+def scored_shares(summary: Summary, metrics: Iterable[str]) -> list[str]:
+    """A phrase for each of these metrics and split with the share that is scored of the model."""
+    found = {split: each.scores.shares.get("model", {}) for split, each in summary.splits.items()}
+    return [
+        f"{split_title(split)}: {100 * shares[name]:.0f} % of {name} scored"
+        for split, shares in found.items()
+        for name in metrics
+        if name in shares
+    ]
 
 
 def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:

@@ -19,7 +19,7 @@ from acwm_core.evaluation.views import metric_and_view, of_view
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
 from acwm_report.run import EvaluatedRun, described
-from acwm_report.table import MISSING, PLAIN, Cell, Column, Row, Scale, Table
+from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale, Table
 from acwm_report.titles import BESIDE, ROWS, branch_title, clips_title, label_title, split_title
 from acwm_report.videos import EmbeddedVideo
 
@@ -64,19 +64,23 @@ def _score_rows(
 def state_tables(run: EvaluatedRun) -> list[Table]:
     """One table per split with a line per state metric, and the noise floors beside the scores.
 
+    Beside the model's score is the share of bodies and frames in which it shows what is measured.
+
     The columns are the rows of the evaluation. Metrics that are defined nowhere are left out, and
     so are evaluation rows in which no metric is defined.
     """
     tables: list[Table] = []
     for split, result in run.summary.splits.items():
         rows: list[Row] = []
-        scores = result.scores.rows
+        scores, shares = result.scores.rows, result.scores.shares.get("model", {})
         kinds = [kind for kind in BESIDE if _defined(scores.get(kind, {}), run.metrics("states"))]
         for name in run.metrics("states"):
             info, scale = run.summary.metrics[name], run.scale(name)
             way = "higher is better" if info.higher_is_better else "lower is better"
             if any(_defined(scores[kind], [name]) for kind in kinds):
                 cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
+                if shares:
+                    cells.insert(1, Cell.of(Estimate(shares.get(name)), PERCENT))
                 undefined = result.scores.undefined.get(name, 0)
                 left_out = f"not defined on {undefined} clips" if undefined else ""
                 rows.append(
@@ -84,6 +88,8 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
                 )
         if rows and run.metrics("pixels"):
             columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
+            if shares:
+                columns.insert(1, Column("Scored", PERCENT.unit, key="scored"))
             title = _title(split, result)
             tables.append(Table(title, columns, rows, "Metric", name=f"measures-{split}"))
     return tables

@@ -48,6 +48,10 @@ def print_summary(summary: Summary) -> None:
         "± is half the 95 % confidence interval over episodes; `other actions`: the model was "
         "given another episode's actions"
     )
+    if any(result.scores.shares for result in summary.splits.values()):
+        click.echo(
+            "scored: share of the bodies and frames in which the model shows what is measured"
+        )
     for reason in dict.fromkeys(summary.left_out.values()):
         names = [name for name, why in summary.left_out.items() if why == reason]
         click.echo(f"left out: {', '.join(names)}: {reason}")
@@ -106,12 +110,19 @@ def _split_table(summary: Summary, split: str) -> Table:
     clips = f"{scores.clips} clips"
     if scores.episodes != scores.clips:
         clips += f" of {scores.episodes} episodes"
-    table = plain_table(f"{split}: {clips}", "", [ROWS.get(row, row) for row in scores.rows])
+    heads = [ROWS.get(row, row) for row in scores.rows]
+    shares = scores.shares.get("model", {})
+    place = list(scores.rows).index("model") + 1
+    if shares:
+        heads.insert(place, "scored")
+    table = plain_table(f"{split}: {clips}", "", heads)
     for name, metric in summary.metrics.items():
         shown = [
             _text(values[name], interval=row == "model" and name == summary.headline)
             for row, values in scores.rows.items()
         ]
+        if shares:
+            shown.insert(place, f"{100 * shares[name]:.0f} %" if name in shares else "")
         table.add_row(f"{name} {metric.unit}".strip(), *shown)
     return table
 

@@ -71,7 +71,26 @@ def test_an_object_may_be_hidden_behind_another():
     def cover(masks):
         masks[:] = boxes(len(masks), (20, 20), None)  # a stands where b was
 
-    assert Permanence().value(clip(SOLID, seen=broken(cover), true=TRUE, names=NAMES)) == 1
+    assert Permanence().value(clip(SOLID, seen=broken(cover), names=NAMES)) == 1
+    late = clip(SOLID, seen=broken(cover, 7), true=broken(cover), names=NAMES)
+    assert Permanence().value(late) == 1
+
+
+def test_nothing_is_hidden_but_by_what_is_there_in_truth():
+    def black(masks):  # estimators take what they never saw for something
+        masks[:] = 1
+
+    assert Permanence().value(clip(SOLID, seen=broken(black), true=TRUE, names=NAMES)) == 0.5
+
+
+def test_what_hardly_differs_from_its_surroundings_is_not_there():
+    video = torch.zeros(FRAMES, 3, SIDE, SIDE)
+    for instance, colour in ((1, 0.5), (2, 1.0)):
+        video[:] += colour * torch.from_numpy(instance == TRUE)[:, None]
+    for light, found in ((0.3, 1.0), (0.2, 0.5)):
+        faint = torch.where(torch.arange(FRAMES)[:, None, None, None] < 5, video, light * video)
+        seen = replace(clip(SOLID, true=TRUE, names=NAMES), video=faint, target=video)
+        assert Permanence().value(seen) == found
 
 
 def test_it_may_be_carried_behind_what_all_but_hid_it():
@@ -79,11 +98,13 @@ def test_it_may_be_carried_behind_what_all_but_hid_it():
     steps = [boxes(1, (row, 20), (20, 20))[0] for row in (3, 12, 15)]
     hand = [boxes(1, (20 - k, 20 - k))[0] for k in range(2, 9)]
     steps[2][18:24, 20:26] = 1
-    held = clip(SOLID, seen=np.stack([*steps, *hand]), true=TRUE, names=NAMES)
+    held = clip(SOLID, seen=np.stack([*steps, *hand]), names=NAMES)
     assert Violations().value(held) == 1  # what has no position stays where it is
     loose = Physics(objects=NAMES, readings=(Reading("place", "position", NAMES),))
-    held = clip(loose, seen=np.stack([*steps, *hand]), true=TRUE, names=NAMES)
+    held = clip(loose, seen=np.stack([*steps, *hand]), names=NAMES)
     assert Violations().value(held) == 0
+    never = clip(loose, seen=np.stack([*steps, *hand]), true=TRUE, names=NAMES)
+    assert Violations().value(never) == 1  # the true hand did not take it
     gone = clip(loose, seen=np.stack([*steps[:2], *hand]), true=TRUE[:9], names=NAMES)
     assert Violations().value(gone) == 1  # it vanished in full sight
 
@@ -135,7 +156,7 @@ def test_what_is_hidden_for_longer_than_anything_is_was_taken_away():
     physics = Physics(objects=NAMES[:2], shapes=NAMES[2:])
     for unseen, found in ((math.inf, 0), (8, 0), (7, 1)):
         limited = replace(physics, unseen=unseen)
-        seen = clip(limited, seen=broken(cover, start=3), true=TRUE, names=NAMES)
+        seen = clip(limited, seen=broken(cover, start=3), names=NAMES)
         assert Permanence().value(seen) == 1
         assert Violations().value(seen) == found
     assert calibrate([seen])["objects.unseen"] == 9  # a fifth longer than these seven frames
@@ -182,11 +203,40 @@ def test_the_depth_of_the_deepest_overlap():
     states = {"wall": np.full(FRAMES, 1.0), "reach": np.full(FRAMES, 1.5)}
     read = {"reach": np.where(np.arange(FRAMES) < 6, 1.5, 0.9)}
     seen = clip(Physics(gaps=gaps), states=states, read=read)
-    assert Penetration().per_frame(seen) == pytest.approx([0] * 6 + [0.1] * 4)
+    near = [math.nan] * 6 + [0.1] * 4  # where they do not meet there is nothing to measure
+    assert Penetration().per_frame(seen) == pytest.approx(near, nan_ok=True)
     assert violations(seen)["ground in a"].sum() == 4
     lost = clip(Physics(gaps=gaps), states=states, read={"reach": np.full(FRAMES, np.nan)})
     assert np.isnan(Penetration().value(lost))
     assert Violations().value(lost) == 0
+
+
+def test_bodies_run_into_one_that_vanished():
+    """b vanishes at 0.5 m; a moves on through this place, from 0 to 0.9 m."""
+    places = np.stack([np.linspace(0, 0.9, FRAMES), np.full(FRAMES, 0.5)], 1)[..., None]
+    gap = Gap("pair", ("a", "b"), lambda seen, start: 0.2 - overlap(seen.states["place"]), solid=0)
+    physics = Physics((Reading("place", "position", ("a", "b")),), gaps=(gap,))
+    read = np.where(np.arange(FRAMES)[:, None, None] < 3, places, [[np.nan], [np.nan]])
+    read[:, 0] = places[:, 0]
+    for states in (places, read):
+        seen = clip(
+            physics, true=TRUE, states={"place": places}, read={"place": states}, names="ab"
+        )
+        assert np.nanmax(Penetration().per_frame(seen)) == pytest.approx(0.2)
+
+
+def overlap(places):
+    """Two bodies of 0.2 m overlap by what this is above 0.2 m."""
+    return 0.4 - np.abs(places[:, 0, 0] - places[:, 1, 0])
+
+
+def test_a_length_that_is_not_found_is_lost():
+    physics = Physics(constants=(Constant("rod", "length", level, 0.1),))
+    read = np.where(np.arange(FRAMES) < 5, 1.0, np.nan)
+    seen = clip(physics, states={"level": np.ones(FRAMES)}, read={"level": read})
+    assert LengthError().per_frame(seen).tolist() == [0] * 5 + [1] * 5
+    assert LengthError().coverage(seen, np.zeros(FRAMES)) == 0.5
+    assert Violations().value(seen) == 1
 
 
 def test_one_clip_in_200_may_err_more():

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from acwm_core.env.physics import Gap, Physics
+from acwm_core.env.physics import Gap, Physics, Reading
 from acwm_metrics.calibrate import best_touch, f1_score
 from acwm_metrics.contact import (
+    WINDOW,
     ContactPrecision,
     ContactRecall,
     ContactTiming,
@@ -13,7 +14,7 @@ from acwm_metrics.contact import (
     beginnings,
     matched,
 )
-from tests.metrics.seeing import clip
+from tests.metrics.seeing import boxes, clip
 
 FRAMES = 60
 PHYSICS = Physics(
@@ -62,6 +63,26 @@ def test_no_event_is_no_score_and_no_weight():
     prediction = seen(touching(), touching((0, 20)))  # being in contact at first is no event
     assert np.isnan(ContactRecall().value(prediction))
     assert ContactRecall().weight(prediction) == 0
+
+
+def test_a_contact_of_what_is_not_found_is_missed_and_wrong():
+    """b vanishes before its second contact; the truth shows it to the end."""
+    bodies = Physics(
+        readings=(Reading("place", "position", ("a", "b")),),
+        gaps=(Gap("pair", ("a", "b"), lambda seen, start: seen.states["place"][:, 1], touch=0.01),),
+    )
+    true = touching((5, 9), (30, 33))
+    place = np.stack([np.zeros(FRAMES), np.where(true, 0.0, 0.1)], 1)
+    read, contacts = place.copy(), [(frame, 1, 2) for frame in np.flatnonzero(true)]
+    read[20:, 1] = np.nan
+    for masks, precision in ((boxes(FRAMES, (2, 2), (9, 9)), 0.5), (boxes(FRAMES, (2, 2)), 1.0)):
+        given = {"true": masks, "states": {"place": place}, "read": {"place": read}, "names": "ab"}
+        lost = clip(bodies, contacts=contacts, **given)
+        assert ContactPrecision().value(lost) == precision
+        assert ContactRecall().value(lost) == 0.5
+    lost = clip(bodies, contacts=contacts, **given | {"true": boxes(FRAMES, (2, 2), (9, 9))})
+    assert ContactTimingInFrames().value(lost) == (0 + WINDOW) / 2
+    assert ContactTiming().coverage(lost, read) == pytest.approx((60 + 20) / 120)
 
 
 def test_the_summary_is_that_of_all_events():

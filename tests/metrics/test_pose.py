@@ -6,6 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from acwm_core.env.physics import Physics, Reading
 from acwm_metrics.pose import (
+    LARGEST,
+    PERIODS,
     OrientationError,
     PixelPositionError,
     PositionError,
@@ -13,15 +15,16 @@ from acwm_metrics.pose import (
     rotations_of,
     turn_between,
 )
-from tests.metrics.seeing import clip
+from tests.metrics.seeing import boxes, clip
 
 FRAMES = 5
 PLACES = np.random.default_rng(0).uniform(-1, 1, (FRAMES, 2, 3)).astype(np.float32)
 
 
-def positions(read, **more):
+def positions(read, true=None, **more):
     physics = Physics((Reading("place", "position", ("a", "b"), present=more.pop("present", "")),))
-    return clip(physics, states={"place": PLACES, **more}, read={"place": read})
+    states = {"place": PLACES, **more}
+    return clip(physics, true=true, states=states, read={"place": read}, names="ab")
 
 
 def test_a_copy_of_the_first_frame_is_off_by_the_true_displacement():
@@ -46,11 +49,24 @@ def test_bodies_that_do_not_exist_or_are_not_seen_do_not_count():
     assert np.nansum(errors) == 0
 
 
+def test_what_the_truth_shows_counts_where_it_was_last_seen():
+    true = boxes(FRAMES, (2, 2), (20, 20))
+    read = PLACES.copy()
+    read[0], read[2:4] = np.nan, np.nan
+    seen = PLACES[[0, 1, 1, 1, 4]]  # before anything is seen, the given frame tells
+    error = PositionError().per_frame(positions(read, true))
+    assert error == pytest.approx(np.linalg.norm(seen - PLACES, axis=-1).mean(1), rel=1e-6)
+    assert PositionError().coverage(positions(read, true), error) == pytest.approx(2 / 5)
+    hidden = np.where(np.arange(FRAMES)[:, None, None] < 4, true, true[:1] * 0)
+    read[:4], read[4] = PLACES[:4], np.nan
+    assert np.isnan(PositionError().per_frame(positions(read, hidden))[4])
+
+
 def test_a_curve_may_be_read_from_either_end():
     rope = np.random.default_rng(1).normal(size=(FRAMES, 9, 2))
     physics = Physics((Reading("rope", "curve", ("rope",)),))
     for read, error in ((rope[:, ::-1], 0.0), (rope + np.array([0.3, 0.4]), 0.5)):
-        seen = clip(physics, states={"rope": rope}, read={"rope": read})
+        seen = clip(physics, states={"rope": rope}, read={"rope": read}, names=["rope"])
         assert PositionError().value(seen) == pytest.approx(error, abs=1e-9)
 
 
@@ -66,8 +82,12 @@ def test_a_curve_may_be_read_from_either_end():
 def test_angles_count_up_to_what_looks_the_same(symmetry, turned, error):
     physics = Physics((Reading("yaw", "angle", ("a",), symmetry),))
     yaw = np.linspace(-3, 3, FRAMES)
-    seen = clip(physics, states={"yaw": yaw}, read={"yaw": yaw + turned})
+    seen = clip(physics, states={"yaw": yaw}, read={"yaw": yaw + turned}, names="a")
     assert OrientationError().value(seen) == pytest.approx(error)
+    gone, there = np.full(FRAMES, np.nan), boxes(FRAMES, (2, 2))
+    seen = clip(physics, true=there, states={"yaw": yaw}, read={"yaw": gone}, names="a")
+    assert OrientationError().value(seen) == pytest.approx(PERIODS[symmetry] / 2)
+    assert OrientationError().coverage(seen, gone) == 0
 
 
 @pytest.mark.parametrize(("symmetry", "order"), [("none", 1), ("box", 4), ("cube", 24)])
@@ -82,13 +102,15 @@ def test_rotations_of_a_body_form_its_group(symmetry, order):
 
 def test_turns_agree_with_scipy():
     rng = np.random.default_rng(2)
-    a, b = (Rotation.random(50, rng) for _ in range(2))
+    a, b = (Rotation.random(2000, rng) for _ in range(2))
     found = turn_between(*(np.roll(each.as_quat(), 1, axis=1) for each in (a, b)), "none")
     assert found == pytest.approx((a * b.inv()).magnitude(), abs=1e-6)
-    cube = Rotation.create_group("O")  # its 24 rotations
-    least = np.min([(a * turn * b.inv()).magnitude() for turn in cube], axis=0)
-    found = turn_between(*(np.roll(each.as_quat(), 1, axis=1) for each in (a, b)), "cube")
-    assert found == pytest.approx(least, abs=1e-6)
+    for symmetry, group in (("cube", "O"), ("box", "D2"), ("none", "C1")):
+        turns = Rotation.create_group(group)  # 24, 4 and 1 rotations
+        least = np.min([(a * turn * b.inv()).magnitude() for turn in turns], axis=0)
+        found = turn_between(*(np.roll(each.as_quat(), 1, axis=1) for each in (a, b)), symmetry)
+        assert found == pytest.approx(least, abs=1e-6)
+        assert 0.8 * LARGEST[symmetry] < found.max() <= LARGEST[symmetry]
 
 
 def test_angles_are_never_more_than_half_a_period():

@@ -41,10 +41,19 @@ def test_outlines_are_as_far_apart_as_they_were_moved():
     assert OutlineError().value(clip(shaped, true=bar, names=("a",))) == 0
 
 
-def test_an_outline_that_is_not_there_is_not_measured():
+def test_an_outline_that_is_not_found_counts_as_it_was_last_seen():
     shaped = Physics(shapes=("a",))
-    gone = np.zeros_like(TRUE)
-    assert np.isnan(OutlineError().value(clip(shaped, seen=gone, true=TRUE, names=NAMES)))
+    bar = np.zeros((3, SIDE, SIDE), np.uint8)
+    bar[0, :, 10:18] = bar[1, :, 12:20] = bar[2, :, 14:22] = 1
+    for frames, kept in (([0, 1], [0, 1, 1]), ([], [0, 0, 0])):  # the given frame is always known
+        seen = np.zeros_like(bar)
+        seen[frames] = bar[frames]
+        held = OutlineError().per_frame(clip(shaped, seen=bar[kept], true=bar, names=("a",)))
+        lost = clip(shaped, seen=seen, true=bar, names=("a",))
+        assert OutlineError().per_frame(lost).tolist() == held.tolist()
+        assert OutlineError().coverage(lost, held) == pytest.approx(len(frames) / 3)
+    hidden = clip(shaped, seen=0 * bar, true=0 * bar, names=("a",))
+    assert np.isnan(OutlineError().value(hidden))
 
 
 def test_height_errors_are_the_mean_over_all_places():
