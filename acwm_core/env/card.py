@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
@@ -115,6 +116,15 @@ class EnvironmentCard:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fps", plain_rate(self.fps))
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        """The views without what all their names begin with, up to a dot or a slash."""
+        parts = [re.split(r"(?<=[./])", view) for view in self.views]
+        common = 0
+        while len({part[common] for part in parts}) == 1 and min(map(len, parts)) > common + 1:
+            common += 1
+        return tuple("".join(part[common:]) for part in parts)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""

@@ -253,7 +253,7 @@ def _summarise(
         environment={
             **{name: getattr(card, name) for name in ("name", "summary", "fps", "citation")},
             "action": asdict(card.action),
-            **({"views": card.views} if card.views else {}),
+            **({"views": card.view_names} if card.views else {}),
         },
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},

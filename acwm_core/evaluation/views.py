@@ -37,7 +37,7 @@ def metrics_of_views(
     found: dict[str, Metric] = {}
     left_out: dict[str, str] = {}
     own = _card_of_a_view(card) if card.views else card
-    for view in card.views:
+    for view in card.view_names:
         for name, metric in metrics.items():
             if metric.reads != "pixels" or isinstance(metric, SetMetric):
                 continue
@@ -57,7 +57,7 @@ def parts_of(prediction: Prediction) -> dict[str, Prediction]:
         return parts
     own = _card_of_a_view(card)
     width = own.frame_size[1]
-    for place, view in enumerate(card.views):
+    for place, view in enumerate(card.view_names):
         columns = slice(place * width, (place + 1) * width)
         parts[view] = replace(
             prediction,

@@ -36,6 +36,7 @@ from acwm_core.model.world_model import Mode
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, load_run
 from acwm_core.training.run_folder import RunFolder, find_run
+from acwm_dream.captions import enlarged
 
 SQUEEZED = 0.02
 """A picture whose sides have another ratio than the frames, by so much, is not used silently."""
@@ -61,8 +62,9 @@ def rollout_run(
     """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
 
     By default, the context frames (as many as the model was trained with) and the actions come from
-    a recorded episode. The video then shows truth | prediction | difference. With other actions or
-    another picture, it shows the prediction only.
+    a recorded episode. The video then shows truth | prediction | difference, one below the other if
+    a frame shows several views. With other actions or another picture, it shows the prediction
+    only.
 
     Args:
         run: the run folder.
@@ -169,17 +171,16 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
 
 def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:
     """Write the file; only one chunk of the video is in memory at a time."""
-    scale = videos.magnification(card.frame_size[0])
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
-        joined = (videos.join(frame, axis=1) for frame in frames)
-        write_mp4(out, joined, card.fps, scale)
+        joined = (videos.join(frame, axis=0 if card.views else 1) for frame in frames)
+        write_mp4(out, (enlarged(each, card) for each in joined), card.fps)
     else:
         numbers = strip_frames(count)
         selection = [frame for index, frame in enumerate(frames) if index in numbers]
         strip = frame_strip([np.stack(panel) for panel in zip(*selection, strict=True)])
         with written_whole(out) as partial:
-            Image.fromarray(strip.repeat(scale, 0).repeat(scale, 1)).save(partial, out.suffix[1:])
+            Image.fromarray(enlarged(strip, card)).save(partial, out.suffix[1:])
 
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -36,6 +36,7 @@ def about_world(
         "fps": card.fps,
         "stride": stride,
         "size": card.frame_size,
+        "views": card.view_names,
         "controls": controls,
         "points": len(controls) // 2 if pointing else 0,
         "reach": [places(pointing, np.array(bound)) for bound in bounds],

@@ -133,6 +133,7 @@ class LiveWorld:
         return {
             **shared,
             "recorded": self.recorded,
+            "engine": "" if self.recorded else card.engine,
             "drivers": _describe_drivers() if self.tasks else [],
             "tasks": [_describe_task(name, task) for name, task in self.tasks.items()],
             "metrics": self.instruments.about,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import AcwmError, is_for_users, sentence
 from acwm_play import messages
-from acwm_play.action_source import PERSON, ActionSource
+from acwm_play.action_source import PERSON, POLICY, ActionSource
 from acwm_play.clock import SPEEDS, Clock
 from acwm_play.figures import pixel_error
 from acwm_play.live_world import LiveWorld
@@ -86,6 +86,8 @@ class Session:
                 self._clock.speed = value
             case messages.Drive(by, task):
                 self._source.hand_to(by, task)
+                apart = self._live is not None and self._live.apart
+                self._take_over |= by == POLICY and apart  # so that both can be compared again
             case messages.Record(on):
                 self._keep_recording = on
             case _:

@@ -76,9 +76,15 @@ def published_scores(row: PublishedRow | None) -> ModelScores:
 
 
 def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
-    """The pixel metrics that were measured; only the published ones, if there are any."""
+    """The pixel metrics that were measured; only the published ones, if there are any.
+
+    Of single views, it is only the one that ranks clips.
+    """
     metrics = {name: info for each in summaries for name, info in described(each.metrics).items()}
     pixels = {name: info for name, info in metrics.items() if info.reads == "pixels"}
+    headlines = {each.headline for each in summaries}
+    named = {name: metric_and_view(name) for name in pixels}
+    pixels = {n: i for n, i in pixels.items() if not named[n][1] or named[n][0] in headlines}
     quoted = [published_scores(each.published.row) for each in summaries if each.published]
     published = {name for scores in quoted for _, name in scores}
     return {n: info for n, info in pixels.items() if n in published} or pixels

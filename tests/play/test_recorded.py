@@ -1,6 +1,7 @@
 """A model of recorded data: the person drives it alone, beside the recorded video."""
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from acwm_core.recipe import Recipe
 from acwm_formats.arrays import Recording, write_dataset
 from acwm_play.pool import WorldPool
 from acwm_play.worlds import playable
+from tests.browsing import DESK
 from tests.play import follower
+from tests.play.pages import Served, until
 from tests.play.test_server import played, white
 from tests.tiny import save_run
 
@@ -32,6 +35,9 @@ def run(tmp_path_factory):
     action = ActionSpec(("x", "y"), ("", ""), (-1, -1), (1, 1), "absolute")
     splits = {"train": [recording(0)], "ind_test": [recording(1), recording(2)]}
     write_dataset(folder / "data", splits, name="mine", action=action, fps=10, progress=False)
+    card = DatasetCard.read(folder / "data")
+    shown = replace(card.environment, views=("cameras.top", "cameras.wrist"))
+    replace(card, environment=shown).write(folder / "data")
     follower.register()
     recipe = Recipe.from_dict(
         {
@@ -69,6 +75,10 @@ def test_the_person_drives_the_model_and_the_recording_goes_on(pool, tmp_path):
         shown = round(10 * head["alone"])
         np.testing.assert_array_equal(true, truth[shown - 3 : shown + 1])
         assert head["pixel_error"] is None  # the video is not of these actions
+        await page.say("drive", by="policy")  # the model starts over, and both are compared
+        head, true, seen = await page.until(lambda found: found[0]["pixel_error"] is not None)
+        assert head["alone"] == 0
+        np.testing.assert_allclose(true.astype(int), seen, atol=1)
         await page.say("record", on=True)
         assert "Nothing is saved" in (await page.told("notice"))["text"]
 
@@ -92,6 +102,29 @@ def test_the_recorded_actions_can_drive_until_the_recording_ends(pool, tmp_path)
         assert (await page.until(lambda found: found[0]["alone"] == 0))[0]["n"] == 1
 
     played(pool, tmp_path, story)
+
+
+def test_the_page_names_the_views_and_says_what_is_not_compared(run, browser, tmp_path):
+    served = Served(run, tmp_path)
+    served.start()
+    try:
+        page = browser.new_page(viewport=DESK)
+        page.goto(served.url)
+        until(page, "document.body.classList.contains('uncompared')")  # the person drives
+        names = page.locator(".sim .views span")
+        assert names.all_inner_texts() == ["top", "wrist"]
+        box, wrist = page.locator("#sim").bounding_box(), names.nth(1).bounding_box()
+        assert wrist["x"] == pytest.approx(box["x"] + box["width"] / 2, abs=1)
+        assert "does not follow" in page.locator(".sim .veil").inner_text()
+        assert not page.locator("#record").is_visible()
+        assert not page.locator("#factors-title").is_visible()
+        page.keyboard.press("p")
+        page.keyboard.press("b")  # from its start, as it may have ended
+        until(page, "!document.body.classList.contains('uncompared')")
+        assert not page.locator(".sim .veil").is_visible()
+        page.close()
+    finally:
+        served.kill()
 
 
 def test_without_simulator_and_data_nothing_is_played(run, tmp_path):

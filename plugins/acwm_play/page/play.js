@@ -303,9 +303,14 @@ function enter(about) {
   }
   document.title = `${about.environment} · acwm play`;
   document.querySelector(".sim figcaption b").textContent = about.recorded ? "Recording" : "Simulator";
-  document.querySelector("input[value=policy] + span .served-only").textContent = about.recorded ? "Recording" : "Policy";
-  $("engine").textContent = about.recorded ? "" : about.engine;
+  document.body.classList.toggle("recorded", about.recorded);
+  document.body.classList.toggle("wide-frames", about.size[1] > 1.5 * about.size[0]);
+  $("engine").textContent = about.engine;
   $("summary").textContent = about.summary;
+  for (const row of all(".views")) {
+    row.replaceChildren(...about.views.map((each) => make("span", each)));
+    row.hidden = !about.views.length;
+  }
   badges(about);
   forgetGoal();
   factorList(about);
@@ -316,7 +321,7 @@ function enter(about) {
 
 function badges(about) {
   const shifted = about.ood.map((each) => make("span", `out of distribution: ${each.replaceAll("_", " ")}`, "ood"));
-  $("badges").replaceChildren(make("span", `scene ${about.index}`), ...shifted);
+  $("badges").replaceChildren(make("span", `${about.recorded ? "episode" : "scene"} ${about.index}`), ...shifted);
 }
 
 function menu(about) {
