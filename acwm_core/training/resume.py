@@ -68,7 +68,7 @@ def checkpoint_to_resume(
         return None
     if resume is None:
         way = f"continue it by resume={run.path}" if last else "it has no checkpoint: remove it"
-        raise TrainingError(f"{run.path} holds a run already: {way}, or choose another folder")
+        raise TrainingError(f"{run.path} holds a run already: {way}, or choose another --out")
     differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
     differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
     if differences:

@@ -238,6 +238,7 @@ def import_format(
     run the same command again to continue.
     """
     from acwm_formats.recordings import import_dataset
+    from acwm_formats.sizes import small_size
     from acwm_formats.survey.survey import short_form, survey
     from acwm_formats.timeline import RecordedDataset
 
@@ -256,6 +257,13 @@ def import_format(
         _print_notes(card.source)
         for line in short_form(survey(out / name)):
             click.echo(line)
+        height, width = card.environment.frame_size
+        camera = height, width // max(1, len(card.environment.views))
+        if (smaller := small_size(camera)) != camera:
+            click.echo(
+                f"· frames of {camera[0]}×{camera[1]} train slowly: --size "
+                f"{smaller[0]}x{smaller[1]} is what the recipe small is for"
+            )
         click.echo(f"next: acwm fit small data.path={out / name}")
 
 

@@ -239,8 +239,16 @@ class _Import:
         there = DatasetCard.read(self.out)
         if there.source.get("plan") == plan and set(there.checksums) == set(there.splits):
             return there
-        now = replace(there, source={**there.source, **self.recorded.facts, "plan": plan})
-        raise other_dataset(self.out, there.differences(now))
+        now = replace(there, source={**there.source, **self.recorded.facts, **self._command()})
+        raise other_dataset(self.out, there.differences(now) or ["its recordings have changed"])
+
+    def _command(self) -> dict[str, str]:
+        """The command that imports the same again, if there is one."""
+        if self.recorded.options is None:
+            return {}
+        kind, name = (str(self.recorded.facts[key]) for key in ("kind", "name"))
+        options = {**self.recorded.options, **self._words()}
+        return {"command": import_command(kind, name, **options)}
 
     def _decoded(self, fps: float, bad: set[tuple[str, int]]) -> list[Staged]:
         versions = package_versions()
@@ -335,11 +343,8 @@ class _Import:
             citation=self.recorded.citation,
             views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
         )
-        source = {**self.recorded.facts, "plan": plan, "notes": self._notes(kept, rows, action)}
-        if self.recorded.options is not None:
-            kind, name = (str(self.recorded.facts[key]) for key in ("kind", "name"))
-            own = {**self.recorded.options, **self._words()}
-            source["command"] = import_command(kind, name, **own)
+        told = {"plan": plan, "notes": self._notes(kept, rows, action)}
+        source = {**self.recorded.facts, **told, **self._command()}
         if skipped:
             source["skipped"] = list(_few(skipped))
         return DatasetCard(
@@ -466,11 +471,15 @@ def _refuse_other_files(out: Path) -> None:
 
 
 def import_command(kind: str, name: str, **options: object) -> str:
-    """The command ``acwm data import KIND NAME --option value …``; options of None are left out."""
+    """The command ``acwm data import KIND NAME --option value …``.
+
+    Options of None or False are left out, and one of True has no value.
+    """
     words = ["acwm", "data", "import", kind, name]
     for option, value in options.items():
         for each in value if isinstance(value, list) else [value]:  # pyright: ignore
-            if each is not None:
-                size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else each
-                words += [f"--{option.replace('_', '-')}", str(size)]
+            if each is None or each is False:
+                continue
+            size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else str(each)
+            words += [f"--{option.replace('_', '-')}", *([] if each is True else [size])]
     return shlex.join(words)

@@ -12,6 +12,7 @@ from acwm_core.env.environment import resolve_size
 from acwm_core.errors import DataError
 
 MIN_SIDE = 16
+SMALL, MOST = 64, 96 * 96  # pixels of a side, and of a frame, that the recipe `small` is for
 
 
 def target_size(
@@ -38,6 +39,14 @@ def target_size(
             "give a smaller --size"
         )
     return wanted
+
+
+def small_size(size: tuple[int, int]) -> tuple[int, int]:
+    """The size of about the same shape that the recipe `small` is for; `size`, if it is small."""
+    if size[0] * size[1] <= MOST:
+        return size
+    short = min(size)
+    return round(size[0] / short * SMALL / 8) * 8, round(size[1] / short * SMALL / 8) * 8
 
 
 def shrunk(frame: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -9,7 +9,8 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.env.environment import ActionSpec
 from acwm_formats.arrays import Recording, write_dataset
-from acwm_formats.survey.survey import short_form, survey
+from acwm_formats.survey.following import _delay
+from acwm_formats.survey.survey import SURE, short_form, survey
 from acwm_report import data_page
 from acwm_report.data_page import write_data_report
 
@@ -108,6 +109,31 @@ def test_defective_frames_are_counted(tmp_path):
     assert counts == (180, 2, 1, 1, 13, 1)
     assert facts.examples["dark"] == [("train", 1, 3), ("train", 1, 4)]
     assert facts.examples["blurred"] == [("train", 4, 20)]
+
+
+def test_what_goes_away_leaves_no_blur(tmp_path):
+    """A square that is always there, and five that are there in most frames."""
+    frames = np.full((30, 48, 48, 3), 255, np.uint8)
+    frames[:, 20:28, 20:28] = (200, 80, 80)
+    frames[:20, 4:12, 4:12] = frames[:20, 4:12, 20:28] = frames[:20, 4:12, 36:44] = (200, 80, 80)
+    frames[:20, 36:44, 4:12] = frames[:20, 36:44, 20:28] = (200, 80, 80)
+    acts = np.random.default_rng(0).uniform(-1, 1, (29, 2))
+    assert survey(written(tmp_path, [Recording(frames, acts)])).frames.blurred == 0
+
+
+def told(*means):
+    """What each of the delays −5 … 5 tells, in 60 episodes."""
+    return np.array(means)[:, None] + np.random.default_rng(0).normal(0, 0.02, (11, 60))
+
+
+def test_a_weak_first_change_leaves_the_delay_uncertain():
+    """A torque held for long: all later changes tell of it, the first one least."""
+    assert _delay(told(0, 0, 0, 0, 0, 0.01, 0.08, 0.06, 0.05, 0.03, 0.02), range(-5, 6))[1] < SURE
+
+
+def test_frames_that_a_policy_answered_are_no_delay():
+    delay = _delay(told(0.02, 0, 0, 0, 0, 0.04, 0.08, 0.06, 0.05, 0.03, 0.02), range(-5, 6))
+    assert delay == (0, pytest.approx(1, abs=0.05))
 
 
 def test_test_episodes_that_were_trained_on_are_found(tmp_path):

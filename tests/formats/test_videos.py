@@ -13,6 +13,7 @@ from acwm_core.data import remote
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
+from acwm_formats.sizes import small_size
 from acwm_formats.videos import Videos
 from tests.formats.corpus import tables
 from tests.formats.corpus.cases import episode
@@ -70,6 +71,28 @@ def test_two_cameras_behind_a_url_become_one_wide_frame(tmp_path, monkeypatch):
     frame = EpisodeDataset(tmp_path / "out", "train")[1].video[3]
     left, right = np.split(frame, 2, axis=1)
     assert (number_in(left), number_in(right)) == (63, 43)
+
+
+def test_a_folder_that_another_command_filled_is_left_alone(tmp_path):
+    for place in (0, 1, 2):
+        tables.write_csv(
+            tmp_path / f"takes/{place}.csv", film(tmp_path / f"takes/{place}.mp4", 0), "time"
+        )
+    words = ["data", "import", "videos", str(tmp_path / "takes"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(main, [*words, "--workers", "0"])
+    assert done.exit_code == 0, done.output
+    command = DatasetCard.read(tmp_path / "out").source["command"]
+    assert "from-first-row" not in command
+    again = CliRunner().invoke(main, [*words, "--workers", "0", "--test-episodes", "1"])
+    assert again.exit_code == 2
+    assert f"source.command is {command} there" in again.output
+    assert "--test-episodes 1 now" in again.output
+
+
+def test_the_advised_size_keeps_the_shape():
+    assert small_size((64, 96)) == (64, 96)
+    assert small_size((480, 640)) == (64, 88)
+    assert small_size((1920, 1080)) == (112, 64)
 
 
 def test_a_worker_gets_what_its_recordings_need(tmp_path):

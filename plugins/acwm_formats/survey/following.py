@@ -195,23 +195,32 @@ def _shown(values: Numbers) -> bool:
 
 
 def _delay(told: Numbers, shifts: Sequence[int]) -> tuple[int | None, float]:
-    """The first change that notably tells of an action, and the share of resamples that agree.
+    """The first change that notably tells of an action, in most resamples, and their share.
 
-    Resamples count what is merely likely as well, so a delay is uncertain if an earlier change may
-    tell something, too.
+    It begins the run of such changes that holds the most telling one: the frames that a policy
+    answers tell of its actions, too, but apart from what the actions do. What is merely likely
+    counts as well, so a delay is uncertain if an earlier change may tell something, too.
     """
-    above = told - np.median(told, 0)  # most shifts show what the regression finds in nothing
+    early = [shift < 0 for shift in shifts]
+    above = told - np.median(told[early], 0)  # what the regression finds in nothing
     certain = _sizes(above) > _limit(above)
     if not certain.any():
         return None, 0.0
-    means = above.mean(1)
-    notable = NOTABLE * means[certain].max()
-    first = int((certain & (means >= notable)).argmax())
+    notable = NOTABLE * above.mean(1)[certain].max()
     picks = np.random.default_rng(0).integers(told.shape[1], size=(RESAMPLES, told.shape[1]))
     again = above[:, picks]
-    seen = (_sizes(again) > LIKELY) & (again.mean(2) >= notable)
-    firsts = np.where(seen.any(0), seen.argmax(0), -1)
-    return shifts[first], float((firsts == first).mean())
+    means = again.mean(2)
+    starts = _starts((_sizes(again) > LIKELY) & (means >= notable), means)
+    counts = np.bincount(starts + 1, minlength=2)[1:]
+    return shifts[int(counts.argmax())], float(counts.max()) / RESAMPLES
+
+
+def _starts(seen: NDArray[np.bool_], means: Numbers) -> NDArray[np.int64]:
+    """Where the run of seen shifts begins that holds the largest mean, by column; −1 if none is."""
+    order = np.arange(len(seen))[:, None]
+    peak = np.where(seen, means, -np.inf).argmax(0)
+    gap = np.where(seen | (order > peak), -1, order).max(0)
+    return np.where(seen.any(0), gap + 1, -1)
 
 
 def _sizes(values: Numbers) -> Numbers:

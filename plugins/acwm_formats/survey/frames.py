@@ -11,6 +11,7 @@ FLAT = 2.0  # standard deviation of a frame's 256 levels up to which it shows no
 SAME = 0.01  # mean difference in levels up to which a frame repeats the one before
 FROZEN = 10  # frames in a row that repeat each other
 SHARP = 0.35  # share of its stretch's median sharpness below which a frame is blurred
+EDGES = 0.99  # quantile of a frame's second differences that is its sharpness
 
 
 @dataclass
@@ -81,8 +82,12 @@ def _runs(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _blurred(grey: NDArray[np.float32], plain: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether the second differences of a frame are far below the median of its stretch."""
+    """Whether the sharpest edges of a frame are far less sharp than is usual in its stretch.
+
+    Those alone count: where something small went away, the others are as sharp as before.
+    """
     inner = grey[:, 1:-1, 1:-1]
     around = grey[:, :-2, 1:-1] + grey[:, 2:, 1:-1] + grey[:, 1:-1, :-2] + grey[:, 1:-1, 2:]
-    sharpness = np.abs(4 * inner - around).mean((1, 2))
+    second = np.abs(4 * inner - around).reshape(len(grey), -1)
+    sharpness = np.quantile(second, EDGES, axis=1)
     return ~plain & (sharpness < SHARP * np.median(sharpness))
