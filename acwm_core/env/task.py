@@ -28,6 +28,10 @@ MAX_DRAWS = 100
 """How many goals are drawn at most to find one that is not already reached at the start."""
 
 
+class SolvedAtStartError(RecipeError):
+    """Every goal that was drawn for an episode is reached in its first frame."""
+
+
 class Goal(NamedTuple):
     """One moment in which a task is solved, as the simulator shows it."""
 
@@ -156,7 +160,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         """As `Environment.reset`; `options` may have a ``goal``.
 
         Raises:
-            RecipeError: every goal drawn was already reached at the start.
+            SolvedAtStartError: every goal drawn was already reached at the start.
         """
         _, info = self.environment.reset(seed=seed, options=options)
         spec = self.environment.episode_spec
@@ -169,7 +173,10 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
             self.judge(info)
             if not info["success"] or "goal" in again:
                 return frame, {**info, "goal": self.goal}
-        raise RecipeError(f"task {self.task.name!r} is solved at the start of every episode here")
+        raise SolvedAtStartError(
+            f"task {self.task.name!r} is solved at the start of episode {spec.index} of "
+            f"{spec.split}, whichever of {MAX_DRAWS} goals is drawn"
+        )
 
     def step(
         self, action: NDArray[np.floating[Any]]

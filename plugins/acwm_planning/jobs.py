@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +47,7 @@ class PlanningJob:
         """The share of its episodes that are in its folder, in [0, 1].
 
         Episodes of other weights or settings do not count. Rows that the task does not have, such
-        as a scripted solution, are not missing.
+        as a scripted solution, are not missing, nor are seeds that are solved at their start.
         """
         try:
             summary: Mapping[str, Any] = parse_json((self.folder / PLAN_SUMMARY).read_bytes())
@@ -56,8 +57,9 @@ class PlanningJob:
             if summary["file_sha256"] != file_sha256(self.run / "model.safetensors"):
                 return 0.0
             present = {(row["row"], seed) for row in summary["rows"] for seed in row["seeds"]}
-            left_out = summary.get("left_out", ())
-            required = {(row, n) for row in self.rows if row not in left_out for n in self.seeds}
+            rows = {*self.rows} - {*summary.get("left_out", ())}
+            seeds = {*self.seeds} - {*summary.get("solved_at_start", ())}
+            required = {*itertools.product(rows, seeds)}
             return 1.0 if required <= present else len(required & present) / len(required)
         except (OSError, ValueError, LookupError, TypeError, AttributeError, DataError):
             return 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.task import Task, TaskEnvironment
+from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
+from acwm_core.errors import AcwmWarning
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
@@ -186,15 +188,20 @@ def plan_episodes(
     }
     results = ResumableResults(out, {**identity, **settings.to_dict()})
     unsolved: set[str] = set()
+    solved: dict[int, SolvedAtStartError] = {}
     try:
         with results.adding():
             for row, seed in missing_episodes(rows, seeds, results.finished()):
-                if row in unsolved:
+                if row in unsolved or seed in solved:
                     continue
                 try:
                     result, controller = player.play(row, seed)
                 except NoSolutionError:
                     unsolved.add(row)
+                    continue
+                except SolvedAtStartError as error:
+                    warnings.warn(f"{error}: it is left out", AcwmWarning, stacklevel=2)
+                    solved[seed] = error
                     continue
                 if seed in seeds[:videos]:
                     player.write_video(out / VIDEOS, row, seed, result, controller)
@@ -202,7 +209,10 @@ def plan_episodes(
                 results.add(line)
                 _write_table(results, facts)
                 report(line)
-            return _write_table(results, {**facts, "left_out": sorted(unsolved)})
+            if len(solved) == len({*seeds}):
+                raise solved[seeds[0]]
+            left = {"left_out": sorted(unsolved), "solved_at_start": sorted(solved)}
+            return _write_table(results, {**facts, **left})
     finally:
         player.close()
 

@@ -10,6 +10,7 @@ import av
 import pytest
 
 from acwm_core.cli import main
+from acwm_core.env.task import Goal
 from acwm_planning.page import write_page
 from acwm_planning.settings import ROW_NAMES, settings_of
 from tests import tiny
@@ -123,6 +124,32 @@ def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
     assert (found["cost"]["name"], found["planner"]["horizon"]) == ("latent", 2)
     assert "planner.horizon=2" in told.splitlines()[0]
     assert told.splitlines()[1] == "not as the task declares: cost=state"
+
+
+def solved_at_the_start(*indices):
+    """A task of the tiny world of which these episodes are solved at their start."""
+    draw = tiny.PLACE.sample_goal
+
+    def sample_goal(environment, rng):
+        solved = environment.episode_spec.index in indices
+        return Goal.now(environment) if solved else draw(environment, rng)
+
+    return sample_goal
+
+
+def test_episodes_that_are_solved_at_their_start_are_left_out(mine, capsys, monkeypatch):
+    monkeypatch.setattr(tiny.PLACE, "sample_goal", solved_at_the_start(1), raising=False)
+    words = ["plan", mine, "place", "--row", "still", "--row", "random", "--videos", "0"]
+    code, _, err = acwm(capsys, *words, "--seeds", "0..2")
+    assert code == 0
+    assert "solved at the start of episode 1 of ind_test" in err
+    folder = mine / "planning" / "place"
+    assert [(each["row"], each["seed"]) for each in lines(folder)] == [
+        (row, seed) for seed in (0, 2) for row in ("random", "still")
+    ]
+    assert json.loads((folder / "summary.json").read_text())["solved_at_start"] == [1]
+    code, _, err = acwm(capsys, *words, "--seeds", "1", "--out", mine / "none")
+    assert (code, "solved at the start" in err) == (2, True)
 
 
 def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from acwm_core.data.shards import file_sha256
-from acwm_core.errors import DataError, RecipeError
+from acwm_core.env.task import Goal
+from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.files import read_json
 from acwm_core.training.run import load_run
 from acwm_planning.policies.commands import print_ranking
@@ -106,6 +107,21 @@ def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
         load_run(tiny.make_exact_run(tmp_path / "one")).world_model, reader, tiny.PLACE
     )
     assert made == single.replay(simulator().start(tiny.spec(1)), rows)
+
+
+def test_seeds_that_are_solved_at_their_start_are_left_out(tmp_path, exact, monkeypatch):
+    draw = tiny.PLACE.sample_goal
+
+    def sample_goal(environment, rng):
+        solved = environment.episode_spec.index == 0
+        return Goal.now(environment) if solved else draw(environment, rng)
+
+    monkeypatch.setattr(tiny.PLACE, "sample_goal", sample_goal, raising=False)
+    with pytest.warns(AcwmWarning, match="solved at the start of episode 0"):
+        found = rank_policies(
+            exact, "place", ["behaviour", "solution"], seeds=(0, 1, 2), out=tmp_path / "ranking"
+        )
+    assert found.episodes == 2
 
 
 def test_results_are_kept_and_gone_on_with(tmp_path, exact, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,10 @@ from numpy.typing import NDArray
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
+from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.env.task import Task, TaskEnvironment
-from acwm_core.errors import DataError, RecipeError
+from acwm_core.env.task import Goal, SolvedAtStartError, Task, TaskEnvironment
+from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
@@ -170,8 +173,7 @@ def rank_policies(
         environment = TaskEnvironment(inner, goal_task)
         stride = world.codec.temporal_stride
         simulator = SimulatorJudge(environment, world.context_frames, stride, estimator)
-        start = simulator.start(spec_of_seed(bundle.card, seeds[0]))
-        solved = is_solvable(inner, goal_task, start.goal)
+        solved = is_solvable(inner, goal_task, _first_goal(simulator, bundle.card, seeds))
         chosen = _parse_policies(policies, solved, goal_task, bundle.card)
         script = ScriptedPolicy("solution" if solved else "behaviour")
         model = ModelJudge(world, estimator, goal_task, steps=steps)
@@ -186,6 +188,14 @@ def rank_policies(
             return ranking
     finally:
         inner.close()
+
+
+def _first_goal(simulator: SimulatorJudge, card: EnvironmentCard, seeds: Sequence[int]) -> Goal:
+    """The goal of the first seed that is not solved at its start."""
+    for seed in seeds[:-1]:
+        with contextlib.suppress(SolvedAtStartError):
+            return simulator.start(spec_of_seed(card, seed)).goal
+    return simulator.start(spec_of_seed(card, seeds[-1])).goal
 
 
 def _parse_policies(
@@ -216,5 +226,8 @@ def _roll_out(
     what = f"ranking at {results.settings['task']}"
     with progress_bar(what, total, done=total - count, shown=progress) as advance:
         for seed in (seed for seed, names in missing.items() if names):
-            results.add(*ranker.lines(seed, missing[seed]))
+            try:
+                results.add(*ranker.lines(seed, missing[seed]))
+            except SolvedAtStartError as error:
+                warnings.warn(f"{error}: seed {seed} is left out", AcwmWarning, stacklevel=2)
             advance(len(missing[seed]))
