@@ -27,7 +27,8 @@ def test_a_run_gets_the_same_scores(name, tmp_path):
     outcome = CliRunner().invoke(main, words)
     assert outcome.exit_code == 0, outcome.output
     after = json.loads((run / "evaluation/summary.json").read_text())["splits"]["ind_test"]
-    found, expected = (values(each["scores"]["rows"]) for each in (after, before))
+    names = ("mse", "psnr")
+    found, expected = (values(each["scores"]["rows"], names) for each in (after, before))
     assert {"model.psnr", "shuffled.psnr", "model.mse"} <= found.keys()
     assert found == pytest.approx({name: expected[name] for name in found}, **SAME)
     assert curve(after) == pytest.approx(curve(before), **SAME, nan_ok=True)
