@@ -140,7 +140,7 @@ def test_test_episodes_that_were_trained_on_are_found(tmp_path):
     train = [blob(n) for n in range(5)]
     near = Recording(train[3].video // 2 * 2, train[3].actions)
     found = survey(written(tmp_path, train, [blob(7), near]))
-    assert [(each.episode, each.trained) for each in found.twins] == [(1, 3)]
+    assert [(each.episode, each.trained) for each in found.near_duplicates] == [(1, 3)]
     assert "1 of 2 test episodes" in texts(found, "bad")
 
 

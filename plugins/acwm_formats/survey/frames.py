@@ -1,15 +1,29 @@
-"""What is wrong with frames: of one colour, repeated, frozen, or blurred."""
+"""What is wrong with frames: of one colour, repeated, frozen, or blurred.
+
+How much a frame changes is the mean over the block and channel that change most, so that something
+small counts like something large. After lossy compression a repeated frame is not quite the same,
+and in slow motion the next frame is nearly the same. So a frame is repeated only amid changes that
+are clear and much larger; and frames of a frozen stretch are all the same, while slow motion adds
+up.
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 FLAT = 2.0  # standard deviation of a frame's 256 levels up to which it shows nothing
-SAME = 0.01  # mean difference in levels up to which a frame repeats the one before
-FROZEN = 10  # frames in a row that repeat each other
+BLOCK = 8  # pixels on a side, of the blocks whose changes are compared
+MOVES = 5.0  # change in levels from which something clearly moves
+REPEATS = 0.25  # share of the changes before and after up to which a frame repeats the one before
+STILL = 2.0  # change in levels that compression makes where nothing moves
+SETTLED = 2  # frames after which a frozen video is as sharp as compression makes it
+DRIFT = 3.0  # change in levels over a frozen stretch, from when it has settled
+FROZEN = 10  # frames in a row that are the same
 SHARP = 0.35  # share of its stretch's median sharpness below which a frame is blurred
 EDGES = 0.99  # quantile of a frame's second differences that is its sharpness
 
@@ -22,8 +36,8 @@ class FrameFacts:
         frames: how many these are.
         dark: frames that are black.
         flat: frames of one colour other than black.
-        repeated: frames that repeat the one before although both neighbours move: a dropped frame
-            was filled, or a slow video was stretched.
+        repeated: frames that repeat the one before amid motion: a dropped frame was filled, or a
+            slow video was stretched.
         frozen: frames of at least `FROZEN` in a row that are the same while actions change.
         blurred: frames far less sharp than the others around them.
         examples: the first places of each, by name: split, episode, frame.
@@ -40,12 +54,22 @@ class FrameFacts:
         self.examples: dict[str, list[tuple[str, int, int]]] = {}
 
     def add(
-        self, place: tuple[str, int, int], video: NDArray[np.uint8], actions: NDArray[np.float32]
+        self,
+        place: tuple[str, int, int],
+        video: NDArray[np.uint8],
+        actions: NDArray[np.float32],
+        views: Sequence[str] = (),
     ) -> None:
-        """Count those of a stretch ``[T, 3, H, W]`` that begins at split, episode and frame."""
+        """Count those of a stretch ``[T, 3, H, W]`` that begins at split, episode and frame.
+
+        A frame counts if any of its `views`, which stand side by side, is defective.
+        """
         split, episode, start = place
         self.frames += len(video)
-        for name, marked in _defects(video, actions).items():
+        parts = np.array_split(video, max(1, len(views)), -1)
+        found = [_defects(part, actions) for part in parts]
+        for name in found[0]:
+            marked = np.any([each[name] for each in found], axis=0)
             setattr(self, name, getattr(self, name) + int(marked.sum()))
             known = self.examples.setdefault(name, [])
             room = max(0, 3 - len(known))
@@ -58,21 +82,44 @@ def _defects(
     grey = video.mean(1, dtype=np.float32)  # [T, H, W]
     plain = grey.std((1, 2)) <= FLAT
     dark = plain & (grey.mean((1, 2)) < 16)
-    still = np.abs(np.diff(grey, axis=0)).mean((1, 2)) <= SAME  # [T − 1]
-    acts = np.append(np.abs(np.diff(actions, axis=0)).max(1, initial=0) > 0, False)  # [T − 1]
-    frozen = np.zeros(len(video), bool)
-    for first, last in _runs(still):
-        if last - first >= FROZEN - 1 and acts[first:last].any():
-            frozen[first + 1 : last + 1] = True
-    alone = np.zeros(len(video), bool)
-    alone[2:-1] = still[1:-1] & ~still[:-2] & ~still[2:] & ~plain[2:-1]
+    changes = np.array([_change(*pair) for pair in itertools.pairwise(video)])  # [T − 1]
     return {
         "dark": dark,
         "flat": plain & ~dark,
-        "repeated": alone,
-        "frozen": frozen,
+        "repeated": _repeated(changes) & ~plain,
+        "frozen": _frozen(video, changes, actions),
         "blurred": _blurred(grey, plain),
     }
+
+
+def _change(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    """The change from one frame ``[3, H, W]`` to another, in levels."""
+    colours, height, width = one.shape
+    side = min(BLOCK, height, width)
+    rows, columns = height // side, width // side
+    apart = np.abs(other.astype(np.int16) - one)[:, : rows * side, : columns * side]
+    return float(apart.reshape(colours, rows, side, columns, side).mean((2, 4)).max())
+
+
+def _repeated(changes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    marked = np.zeros(len(changes) + 1, bool)
+    around = np.minimum(changes[:-2], changes[2:])
+    marked[2:-1] = (around >= MOVES) & (changes[1:-1] <= REPEATS * around)
+    return marked
+
+
+def _frozen(
+    video: NDArray[np.uint8], changes: NDArray[np.float64], actions: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    marked = np.zeros(len(video), bool)
+    acts = np.append(np.abs(np.diff(actions, axis=0)).max(1, initial=0) > 0, False)  # [T − 1]
+    for first, last in [*_runs(changes == 0), *_runs(changes <= STILL)]:
+        if last - first < FROZEN - 1 or not acts[first:last].any():
+            continue
+        settled = video[first + SETTLED]
+        if max(_change(settled, frame) for frame in video[first + SETTLED : last + 1]) <= DRIFT:
+            marked[first + 1 : last + 1] = True
+    return marked
 
 
 def _runs(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -15,8 +15,8 @@ from acwm_formats.survey.actions import ActionSummary, action_facts
 from acwm_formats.survey.following import SHIFTS, Following, Moments, following
 from acwm_formats.survey.frames import FrameFacts
 from acwm_formats.survey.motion import small
+from acwm_formats.survey.near_duplicates import NearDuplicate, near_duplicates
 from acwm_formats.survey.sample import stretches
-from acwm_formats.survey.twins import Twins, twins
 
 SURE = 0.9  # confidence from which a delay is stated and a shift is advised
 
@@ -54,7 +54,7 @@ class Survey:
         actions: each action.
         frames: counts of defective frames in the sample.
         following: whether the video follows the actions; None if that cannot be told.
-        twins: test episodes that nearly equal training episodes.
+        near_duplicates: test episodes that nearly equal training episodes.
         compared: number of test episodes that were compared.
         findings: what to know first; the worst come first.
     """
@@ -65,13 +65,18 @@ class Survey:
     actions: list[ActionSummary]
     frames: FrameFacts
     following: Following | None
-    twins: list[Twins]
+    near_duplicates: list[NearDuplicate]
     compared: int
 
     @property
     def findings(self) -> list[Finding]:
         """All sentences, the bad ones first."""
-        every = [*_of_following(self), *_of_actions(self), *_of_frames(self), *_of_twins(self)]
+        every = [
+            *_of_following(self),
+            *_of_actions(self),
+            *_of_frames(self),
+            *_of_duplicates(self),
+        ]
         return sorted(every, key=lambda each: ("bad", "note", "good").index(each.level))
 
     @property
@@ -108,10 +113,10 @@ def survey(path: str | Path) -> Survey:
     }
     frames, moments = FrameFacts(), list[Moments]()
     for each in stretches(data):
-        frames.add((each.split, each.episode, each.start), each.video, each.actions)
         place = each.split, each.episode
+        frames.add((*place, each.start), each.video, each.actions, card.environment.views)
         moments.append(Moments(place, each.start, small(each.video), each.actions))
-    found, compared = twins(data)
+    found, compared = near_duplicates(data)
     return Survey(
         path=path,
         card=card,
@@ -119,7 +124,7 @@ def survey(path: str | Path) -> Survey:
         actions=action_facts(data, card.environment.action),
         frames=frames,
         following=following(moments),
-        twins=found,
+        near_duplicates=found,
         compared=compared,
     )
 
@@ -195,9 +200,9 @@ def _of_frames(found: Survey) -> Iterator[Finding]:
         yield Finding(level, f"{count} of {facts.frames:,} frames are {PHRASES[name]} ({where})")
 
 
-def _of_twins(found: Survey) -> Iterator[Finding]:
-    if found.twins:
-        first, count = found.twins[0], len(found.twins)
+def _of_duplicates(found: Survey) -> Iterator[Finding]:
+    if found.near_duplicates:
+        first, count = found.near_duplicates[0], len(found.near_duplicates)
         yield Finding(
             "bad",
             f"{count} of {found.compared} test episodes nearly equal training episodes, e.g. "

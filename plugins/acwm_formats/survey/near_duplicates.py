@@ -19,7 +19,7 @@ ALIKE = 0.02  # largest difference of two actions that are the same, in standard
 
 
 @dataclass(frozen=True)
-class Twins:
+class NearDuplicate:
     """A test episode and the training episode that it nearly equals."""
 
     split: Split
@@ -35,7 +35,7 @@ class _Print:
     actions: NDArray[np.float32]
 
 
-def twins(data: Mapping[Split, EpisodeDataset]) -> tuple[list[Twins], int]:
+def near_duplicates(data: Mapping[Split, EpisodeDataset]) -> tuple[list[NearDuplicate], int]:
     """Find test episodes that equal training episodes; also returns how many were compared."""
     if "train" not in data or len(data) == 1:
         return [], 0
@@ -43,7 +43,7 @@ def twins(data: Mapping[Split, EpisodeDataset]) -> tuple[list[Twins], int]:
     frames = np.stack([each.frames for each in known.values()])
     actions = np.stack([each.actions for each in known.values()])
     scale = actions.reshape(-1, actions.shape[-1]).std(0) + 1e-9
-    found: list[Twins] = []
+    found: list[NearDuplicate] = []
     count = 0
     for split, dataset in data.items():
         for index in spread(len(dataset), EPISODES) if split != "train" else ():
@@ -53,7 +53,7 @@ def twins(data: Mapping[Split, EpisodeDataset]) -> tuple[list[Twins], int]:
             for place in np.flatnonzero((apart <= ALIKE).all(-1)):
                 gap = np.abs(frames[place].astype(np.int16) - seen.frames).max()
                 if gap <= NEAR * 255:
-                    found.append(Twins(split, index, list(known)[int(place)]))
+                    found.append(NearDuplicate(split, index, list(known)[int(place)]))
                     break
     return found, count
 
