@@ -1,1 +1,1 @@
-"""What a dataset tells about itself: lengths, actions, frames, near-duplicates, what follows what."""
+"""What a dataset tells about itself: lengths, actions, frames, near-duplicates, and delays."""
