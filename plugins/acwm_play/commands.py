@@ -56,8 +56,10 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
     if folder and len(runs) != 1:
         raise RecipeError("--export writes the page of one run: name one")
     worlds = playable(runs, **options)
-    if worlds[0].data:
-        click.echo(f"left out: {worlds[0].environment} is recorded, so no simulator follows you")
+    if recorded := dict.fromkeys(world.environment for world in worlds if world.data):
+        names = f"{', '.join(recorded)} {'are' if len(recorded) > 1 else 'is'} recorded"
+        gone = "the simulator, and with it factors, tasks, errors of states and recording"
+        click.echo(f"left out, as {names}: {gone}")
     if folder and worlds[0].data:
         raise RecipeError(f"--export needs a simulator, and {worlds[0].environment} is recorded")
     if folder:

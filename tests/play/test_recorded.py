@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import RecipeError
@@ -125,6 +127,14 @@ def test_the_page_names_the_views_and_says_what_is_not_compared(run, browser, tm
         page.close()
     finally:
         served.kill()
+
+
+def test_one_line_says_what_is_left_out(run, monkeypatch):
+    monkeypatch.setattr("acwm_play.serve.serve", lambda worlds, **_: None)
+    done = CliRunner().invoke(main, ["play", str(run)])
+    assert done.exit_code == 0, done.output
+    (line,) = done.output.splitlines()
+    assert "left out, as mine is recorded: the simulator" in line
 
 
 def test_without_simulator_and_data_nothing_is_played(run, tmp_path):
