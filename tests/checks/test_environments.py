@@ -24,7 +24,7 @@ from tests.episodes import assert_same
 CHECKS = checks_of(EnvironmentChecks)
 
 
-QUICK = ("push_rope", "reacher")
+QUICK = ("reacher",)
 """Worlds that `make test` checks; `.ci/run` checks all, and only their variants are slow."""
 
 

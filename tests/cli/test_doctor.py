@@ -10,6 +10,7 @@ from acwm_core.cli import doctor, main
 from acwm_core.plugins import Component, catalog
 
 
+@pytest.mark.ci
 def test_the_report_covers_this_installation(
     fresh_catalog: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

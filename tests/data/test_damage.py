@@ -65,6 +65,7 @@ def encode(data):
     encode_windows(EpisodeDataset(data, "train"), Blocks(), frames=FRAMES, progress=False)
 
 
+@pytest.mark.ci
 def test_encoding_names_it_and_goes_on_when_it_is_mended(data, square_data):
     flip(data)
     with pytest.raises(DataError, match=SENTENCE):

@@ -73,6 +73,7 @@ def assert_as_if_nothing_had_happened(runs, data):
         assert [int(clip) for _, clip in logged] == [truth[int(place)] for place, _ in logged]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.slow)])
 def test_kills_change_nothing(kills, square_data, tmp_path):
     """Each reader has other ranks, another batch size or workers than the one before."""

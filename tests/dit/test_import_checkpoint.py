@@ -117,6 +117,7 @@ def data(tmp_path_factory):
     return folder
 
 
+@pytest.mark.ci
 def test_it_is_evaluated_rolled_out_and_trained_on(latest, wan, data, tmp_path, monkeypatch):
     """On the command line; training starts from the weights, and a run of it goes on as any."""
     monkeypatch.chdir(tmp_path)

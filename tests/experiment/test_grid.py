@@ -9,6 +9,8 @@ from acwm_experiment.grid import read_grid
 from acwm_experiment.plan import make_plan
 from tests.experiment.parts import write_experiment
 
+pytestmark = pytest.mark.ci
+
 GRID = ("model.width=4,6", "training.learning_rate=1e-2,2e-2")
 
 

@@ -18,6 +18,8 @@ from acwm_planning.settings import settings_of
 from tests.experiment.parts import write_experiment
 from tests.folders import wait_until
 
+pytestmark = pytest.mark.ci
+
 FILE = """
 title: Planning
 overrides: [+small]

@@ -196,6 +196,7 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
     assert "Toy/Dot-v0" in gymnasium.registry
 
 
+@pytest.mark.ci
 def test_policies_and_environments_lie_in_the_current_folder(tmp_path, monkeypatch):
     (tmp_path / "my_robot_arm.py").write_text(
         textwrap.dedent(

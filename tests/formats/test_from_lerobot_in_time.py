@@ -138,6 +138,7 @@ def change_action(root, episode, row, value):
     pq.write_table(pa.table(table), path)
 
 
+@pytest.mark.ci
 def test_an_outlier_is_told_and_one_of_a_test_episode_sets_no_bounds(tmp_path):
     root = write(tmp_path / "in", range(8), steps(8), copies=40)
     change_action(root, 39, 3, 1000.0)

@@ -183,6 +183,7 @@ class Counted:
         return self.function(*given)
 
 
+@pytest.mark.ci
 def test_a_killed_import_resumes_where_it_was(published, tmp_path, monkeypatch):
     out, encode = tmp_path / "killed", staging.encode_frames
     calls = itertools.count()

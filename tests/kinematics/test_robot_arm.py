@@ -15,6 +15,8 @@ from acwm_sim.bullet import pybullet
 from acwm_sim.panda import LOWER, MAX_VELOCITY, UPPER
 from tests.sim.playing import start, undrawn
 
+pytestmark = pytest.mark.ci
+
 EPISODES = {"train": 24, "ood_test": 12}
 FIRST_GOAL_ID = FIRST_POST_ID + MAX_POSTS
 SPLITS = {"train": "central", "ood_test": "expanded"}

@@ -12,6 +12,8 @@ from acwm_particle.pour_water import RECORDED, PourWater
 from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
 from tests.sim.playing import start, undrawn
 
+pytestmark = pytest.mark.ci
+
 
 @pytest.fixture(scope="module")
 def unseen():

@@ -10,6 +10,8 @@ from acwm_particle.sand_drawing import BOARD_ID, SAND_ID
 from acwm_particle.sand_layout import DOUBLED, GRAINS
 from tests.sim.playing import start, undrawn
 
+pytestmark = pytest.mark.ci
+
 
 @pytest.fixture(scope="module")
 def unseen():

@@ -27,6 +27,8 @@ from acwm_play.worlds import playable
 from tests.browsing import DESK
 from tests.play import follower
 
+pytestmark = pytest.mark.ci
+
 pytest.importorskip("onnx", reason="needs the extra export")
 
 SIZE = (64, 64)

@@ -112,6 +112,7 @@ def test_names_lead_to_the_first_run_of_their_row(experiment, tmp_path):
         assert f'id="run{run}"' in page
 
 
+@pytest.mark.ci
 def test_the_main_table_is_shown_and_exported_once(experiment, tmp_path):
     main = Experiment(**{**vars(experiment), "name": "main", "table": "main"})
     runs = evaluated(experiment)

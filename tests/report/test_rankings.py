@@ -39,6 +39,7 @@ def mine(evaluated, tmp_path):
     return run
 
 
+@pytest.mark.ci
 def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     weights = Summary.read(mine).provenance["weights_sha256"]
     write_json(mine / "ranking" / "place" / RANKING_FILE, ranking(weights))

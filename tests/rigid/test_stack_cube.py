@@ -9,6 +9,8 @@ from acwm_rigid.stack_cube import DIRECTIONS, SPREAD, StackCube
 from acwm_rigid.stack_simulation import ARM_ID, GREEN, GREEN_ID, GRIPPER_ID, RED, RED_ID
 from tests.sim.playing import start, undrawn
 
+pytestmark = pytest.mark.ci
+
 EPISODES = 12
 
 

@@ -58,6 +58,7 @@ def test_a_missing_libx11_names_the_package(tmp_path: Path):
     assert "apt-get install libx11-6" in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.ci
 def test_what_was_compiled_is_kept_for_the_next_process(tmp_path: Path):
     """With torch and an environment, Taichi is not torn down at the end of a process."""
     (tmp_path / "kernel.py").write_text("""
