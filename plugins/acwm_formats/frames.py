@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
 from acwm_formats.images import channels_last, guessed_range, is_depth, read_image, to_rgb
+from acwm_formats.sources import present
 
 CONTAINERS = {"mp4": (4, b"ftyp moov mdat wide free skip".split()), "gif": (0, [b"GIF8"])} | {
     "matroska": (0, [b"\x1a\x45\xdf\xa3"]),
@@ -90,6 +91,7 @@ class VideoFrames:
     @property
     def stamp(self) -> str:
         """As in `Frames`."""
+        present(self.path)
         return f"{self.path.name} {self.first} {self.stop} {file_stamp(self.path)}"
 
     def read(
@@ -134,9 +136,12 @@ class VideoFrames:
 def video_index(path: Path) -> VideoIndex:
     """Read where the frames of the video `path` lie in time; only its first frame is decoded.
 
+    It is fetched first if it comes from a URL.
+
     Raises:
         DataError: it is missing, damaged, not a video that can be read, or of high dynamic range.
     """
+    present(path)
     return _index(path, file_stamp(path))
 
 

@@ -92,6 +92,7 @@ class HDF5(Format):
             options=options | {"pixel_range": typed(pixel_range)},
             actions=_action(card, layout),
             state=card.state if card and states is None else None,
+            instances=_instances(card),
             notes=(layout.note,) if layout.note and not rate else (),
             summary=card.summary if card else f"Recorded in the layout of {layout.name}",
         )
@@ -106,7 +107,8 @@ class HDF5(Format):
         * ``actions``, float32 ``[T, A]``, raw units; row i leads from frame i to i + 1, the last
           row is 0;
         * ``states/NAME``, ``[T, …]``, and ``contacts``, int32 rows (frame, id, id);
-        * attributes ``spec``, ``factors`` (JSON) and ``ood_label`` (text, empty if there is none).
+        * attributes ``spec``, ``factors``, ``facts`` (JSON) and ``ood_label`` (text, empty if there
+          is none).
 
         The attributes of the file are ``format`` ("acwm"), ``card`` (the dataset's card as JSON)
         and ``episodes`` (their number).
@@ -117,8 +119,10 @@ class HDF5(Format):
                     file.attrs["format"] = "acwm"
                     file.attrs["card"] = json.dumps(export.card.to_dict())
                     file.attrs["episodes"] = len(dataset)
-                    for episode in export.episodes(split):
-                        _write(file.create_group(f"episode_{episode.spec.index:06d}"), episode)
+                    for index, episode in enumerate(export.episodes(split)):
+                        group = file.create_group(f"episode_{episode.spec.index:06d}")
+                        _write(group, episode)
+                        group.attrs["facts"] = json.dumps(dataset.about(index)["facts"])
                         opened.check()
                 opened.check()
 
@@ -204,6 +208,11 @@ def _action(card: EnvironmentCard | None, layout: Layout) -> ActionFacts:
         return ActionFacts(kind=layout.kind)
     spec = card.action
     return ActionFacts(spec.names, spec.units, spec.kind, (spec.low, spec.high))
+
+
+def _instances(card: EnvironmentCard | None) -> tuple[str, ...]:
+    """The names of the ids in masks; none if all are zero."""
+    return card.instances if card and len(card.instances) > 1 else ()
 
 
 def _card(path: Path) -> EnvironmentCard:

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
+from acwm_core.files import parse_json
 from acwm_formats.frames import ImageFrames, file_stamp, regular_times
 from acwm_formats.hdf5_layouts import Layout, array, opened
+from acwm_formats.labels import Labels
 from acwm_formats.timeline import Samples, TimedRecording
 
 
@@ -45,6 +47,7 @@ class HDF5Recordings:
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
         path, name = self.places[index]
+        ours = self.layout.name == "acwm"
         try:
             group = _file(path, file_stamp(path))[name]
             actions = rows(array(group, self.layout.actions))
@@ -56,15 +59,33 @@ class HDF5Recordings:
                 camera: self._frames(path, f"{name}/{where}", len(array(group, where)))
                 for camera, where in self.layout.cameras.items()
             }
+            labels, facts = (_labels(path, group), _facts(group)) if ours else (None, {})
         except (OSError, KeyError, RuntimeError, ValueError) as error:
             raise DataError(f"{path} cannot be read ({error})") from error
         title = path.name if name == "/" else f"{path.name} {name}"
-        return TimedRecording(title, cameras, Samples(actions), states, self.rate)
+        return TimedRecording(
+            title, cameras, Samples(actions), states, self.rate, facts=facts, labels=labels
+        )
 
     def _frames(self, path: Path, name: str, count: int) -> ImageFrames:
         times = regular_times(count, self.rate)
         stamp = f"{name} {file_stamp(path)}"
         return ImageFrames(StoredImages(path, name, count), times, self.pixel_range, stamp=stamp)
+
+
+def _labels(path: Path, group: Any) -> Labels:
+    masks = StoredImages(path, f"{group.name}/masks", len(array(group, "masks")))
+    return Labels(masks, np.asarray(array(group, "contacts")[()], np.int32).reshape(-1, 3))
+
+
+def _facts(group: Any) -> dict[str, Any]:
+    """What our export knows of an episode, with the factors and the shift of a simulated one."""
+    simulated = {
+        "factors": parse_json(group.attrs.get("factors", "{}")),
+        "ood_label": group.attrs.get("ood_label", ""),
+    }
+    facts = parse_json(group.attrs.get("facts", "{}"))
+    return {name: value for name, value in simulated.items() if value} | facts
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from acwm_formats.lerobot_layout import (
     read_places,
 )
 from acwm_formats.names import word
-from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
+from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
 
 FRAME, REWARD = "frame_index", "next.reward"
 
@@ -139,16 +139,7 @@ class LeRobotRecordings:
         table = read_columns(place.data, names, place.episode)
         columns = {name: _numbers(table, name) for name in names}
         numbers = columns[FRAME][:, 0].astype(np.int64)
-        cameras = {
-            name: whole.video(index, name)
-            if name in place.videos
-            else ImageFrames(
-                _RowImages(place, name),
-                numbers / whole.fps,
-                stamp=f"{place.episode} {file_stamp(place.data)}",
-            )
-            for name in _cameras(whole.features)
-        }
+        cameras = _Cameras(tuple(_cameras(whole.features)), index, self.root, numbers / whole.fps)
         facts: dict[str, Any] = {"episode": place.episode, "tasks": list(place.tasks)}
         if rewards:
             facts["rewards"] = columns[REWARD].reshape(-1).tolist()
@@ -161,6 +152,45 @@ class LeRobotRecordings:
             length=place.length,
             facts=facts,
         )
+
+
+@dataclass(frozen=True)
+class _Cameras(Mapping[str, Frames]):
+    """The frames of each camera; a video is looked at, and fetched, only if it is asked for."""
+
+    names: tuple[str, ...]
+    index: int
+    root: Path
+    times: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __getitem__(self, name: str) -> Frames:
+        if name not in self.names:
+            raise KeyError(name)
+        if name not in self._looked_at:
+            with as_one_sentence(self.root):
+                self._looked_at[name] = self._frames(name)
+        return self._looked_at[name]
+
+    @functools.cached_property
+    def _looked_at(self) -> dict[str, Frames]:
+        return {}
+
+    def _frames(self, name: str) -> Frames:
+        whole = _index(self.root)
+        place = whole.places[self.index]
+        if name in place.videos:
+            return whole.video(self.index, name)
+        stamp = f"{place.episode} {file_stamp(place.data)}"
+        return ImageFrames(_RowImages(place, name), self.times, stamp=stamp)
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ class Reading:
         state: the states to keep.
         action: names and units of the actions; their bounds if these are `stated`, else any.
         stated: whether actions beyond the bounds are a defect.
+        instances: names of the ids in masks; none if masks are not taken.
     """
 
     cameras: tuple[str, ...]
@@ -80,6 +81,7 @@ class Reading:
     state: tuple[StateField, ...]
     action: ActionSpec
     stated: bool
+    instances: tuple[str, ...] = ()
 
     def planned(self, recording: TimedRecording) -> Aligned:
         """Align a recording and check it against what all have in common."""
@@ -268,6 +270,7 @@ def common_reading(
     """
     cameras = _cameras(first, options)
     found = first.cameras[cameras[0]].size
+    size = target_size(found, options.size or recorded.size)
     states = recorded.state
     if states is None:
         shapes = {name: np.shape(rows.values)[1:] for name, rows in first.states.items()}
@@ -278,7 +281,7 @@ def common_reading(
     return Reading(
         cameras,
         found,
-        target_size(found, options.size or recorded.size),
+        size,
         bool(options.size or recorded.size),
         options.depth_range,
         options.alignment,
@@ -286,6 +289,7 @@ def common_reading(
         states,
         _action(recorded, np.shape(first.actions.values)),
         recorded.actions.bounds is not None and not recorded.actions.widened,
+        recorded.instances if size == found and len(cameras) == 1 else (),
     )
 
 
@@ -295,8 +299,10 @@ def _cameras(first: TimedRecording, options: ImportOptions) -> tuple[str, ...]:
     for name in options.cameras:
         if name not in first.cameras:
             raise DataError(f"there is no camera {name!r}{suggest(name, first.cameras)}")
-    coloured = [name for name, frames in first.cameras.items() if not frames.depth]
-    return options.cameras or tuple([*coloured, *first.cameras][:1])
+    if options.cameras:
+        return options.cameras
+    coloured = (name for name, frames in first.cameras.items() if not frames.depth)
+    return (next(coloured, next(iter(first.cameras))),)
 
 
 def _action(recorded: RecordedDataset, shape: Sequence[int]) -> ActionSpec:

@@ -65,11 +65,13 @@ def recorded_card(
     engine: str = "recorded",
     citation: str = "",
     views: tuple[str, ...] = (),
+    instances: tuple[str, ...] = (),
 ) -> EnvironmentCard:
-    """The environment card of recorded data: no factors, one instance, no simulator."""
+    """The environment card of recorded data: no factors, no simulator, often no instances."""
+    unseen = "" if instances else UNSEEN
     return EnvironmentCard(
         name=name,
-        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {UNSEEN}".removeprefix(". "),
+        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {unseen}".removeprefix(". ").strip(),
         action=action,
         frame_size=frame_size,
         fps=plain_rate(fps),
@@ -77,7 +79,7 @@ def recorded_card(
         factors=(),
         ood_shifts=(),
         state=tuple(state),
-        instances=("unlabelled",),  # every pixel of the masks has id 0
+        instances=instances or ("unlabelled",),  # every pixel of such masks has id 0
         engine=engine,
         citation=citation,
         views=views,
@@ -120,7 +122,7 @@ def import_dataset(
     parts = divided(recorded, options.test_episodes)
     if not parts:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
-    first = _first(recorded, parts)
+    first = _first(recorded, parts, options.cameras)
     job = _Import(
         recorded,
         Path(out),
@@ -342,6 +344,7 @@ class _Import:
             engine=self.recorded.engine,
             citation=self.recorded.citation,
             views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
+            instances=self.reading.instances,
         )
         told = {"plan": plan, "notes": self._notes(kept, rows, action)}
         source = {**self.recorded.facts, **told, **self._command()}
@@ -382,6 +385,8 @@ class _Import:
                 notes += outliers(rows["train"], action.names)
         for split, some in rows.items():
             notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
+        if self.recorded.instances and not self.reading.instances:
+            notes.append("Masks and contacts were left out, as they are of frames of another size.")
         if alignment.shift:
             notes.append(f"Actions were moved by {alignment.shift} frames.")
         told = [f"{each.name}: {note}" for each in kept for note in each.notes]
@@ -426,14 +431,15 @@ class _Import:
         return fill(self.out, card, source, LocalExecutor(0), progress=False)
 
 
-def _first(recorded: RecordedDataset, parts: Parts) -> TimedRecording:
+def _first(recorded: RecordedDataset, parts: Parts, asked: Sequence[str] = ()) -> TimedRecording:
     """The first recording that can be opened."""
     problem = None
     for split, (recordings, places) in parts.items():
         for index in places:
             try:
                 found = opened(recordings, index, episode_name(split, index), recorded.fps)
-                if any(frames.size for frames in found.cameras.values()) or not found.cameras:
+                cameras = [name for name in asked if name in found.cameras] or found.cameras
+                if not cameras or any(found.cameras[name].size for name in cameras):
                     return found
             except (DataError, OSError) as error:
                 problem = problem or DataError(f"{episode_name(split, index)}: {error}")

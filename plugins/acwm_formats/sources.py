@@ -1,18 +1,31 @@
-"""Where recordings lie: a path, or a URL whose files are fetched first."""
+"""Where recordings lie: a path, or a URL whose files are fetched.
+
+Videos are most of the bytes, and an import needs those of its cameras alone. So all files but
+videos are fetched at first; a video's place is held by an empty file of its size and of the date 0
+until it is read. A file is replaced as a whole, so that nothing half fetched is taken for it.
+"""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from acwm_core.data import remote
 from acwm_core.errors import DataError
-from acwm_core.files import OF_THE_DISK, inside
+from acwm_core.files import OF_THE_DISK, alone, inside, written_whole
 
 AT_ONCE = 8  # files
+VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".gif")
+LISTING = "listing.json"
+
+Marks = dict[str, list[str]]
+"""What tells each file's content apart, by its path below the URL; "" for the URL itself."""
 
 
 def is_url(source: str) -> bool:
@@ -23,37 +36,103 @@ def is_url(source: str) -> bool:
 def fetched(url: str, *, progress: bool = True) -> Path:
     """Fetch the file or folder behind a URL into the cache, and return where it lies there.
 
-    Files that are there already stay; a folder that has changed is fetched as another.
+    Videos in a folder are fetched later, by `present`. Files that are there already stay; a folder
+    that has changed is fetched as another.
 
     Raises:
         DataError: there is nothing behind the URL, or it cannot be fetched.
         MissingExtraError: the package for this kind of URL is not installed.
     """
     url = url.rstrip("/")
-    sizes = _listed(url)
-    told = json.dumps([url, sorted(sizes.items())])
-    digest = hashlib.sha256(told.encode()).hexdigest()[:16]
-    name = PurePosixPath(url).name
-    place = remote.cache_folder() / "imports" / digest / name
-    wanted = {rest: inside(place, rest) if rest else place for rest in sizes}
+    marks = _listed(url)
+    digest = hashlib.sha256(json.dumps([url, sorted(marks.items())]).encode()).hexdigest()[:16]
+    place = _imports() / digest / PurePosixPath(url).name
+    wanted = {rest: inside(place, rest) if rest else place for rest in marks}
     missing = {rest: path for rest, path in wanted.items() if not path.exists()}
+    late = {rest for rest in missing if _is_late(rest, marks[rest])}
     try:
         for path in missing.values():
             path.parent.mkdir(parents=True, exist_ok=True)
-        _fetch_all(url, missing, progress)
+        if not (listing := place.parent / LISTING).exists():
+            with written_whole(listing) as partial:
+                partial.write_text(json.dumps({"url": url, "marks": marks}), encoding="utf-8")
+        for rest in late:
+            _promise(missing[rest], int(marks[rest][0]))
+        _fetch_all(url, {r: path for r, path in missing.items() if r not in late}, progress)
     except OSError as error:
-        where = f"cannot write to {place.parent} ({error.strerror})"
-        raise DataError(f"{where}: make room, or set {remote.CACHE} to another folder") from error
+        raise _unwritable(place.parent, error) from error
     return place
 
 
-def _listed(url: str) -> dict[str, Any]:
-    """What tells each file's content apart, by its path below the URL; "" for the URL itself."""
+def present(path: Path) -> None:
+    """Fetch a video that is only promised; any other file stays as it is.
+
+    Raises:
+        DataError: it cannot be fetched, or has changed since it was listed.
+    """
+    if not _is_promised(path):
+        return
+    parts = path.resolve().relative_to(_imports()).parts
+    url, marks = _listing(_imports() / parts[0] / LISTING)
+    rest = "/".join(parts[2:])
+    try:
+        with alone(path):
+            if not _is_promised(path):
+                return  # another process has fetched it
+            if _now(f"{url}/{rest}") != marks[rest]:
+                raise DataError(f"{url}/{rest} has changed: run the same command again")
+            remote.fetch(f"{url}/{rest}", path)
+    except OSError as error:
+        raise _unwritable(path.parent, error) from error
+
+
+def _now(url: str) -> list[str]:
+    system, name = remote.located(url)
+    try:
+        return _marks(system.info(name))
+    except Exception as error:  # every protocol has its own exceptions
+        raise DataError(f"cannot fetch {url}: {type(error).__name__}: {error}") from error
+
+
+def _is_promised(path: Path) -> bool:
+    try:
+        empty = path.stat().st_mtime_ns == 0
+    except OSError:
+        return False  # whoever reads it will tell
+    return empty and path.resolve().is_relative_to(_imports())
+
+
+def _imports() -> Path:
+    return (remote.cache_folder() / "imports").resolve()
+
+
+def _is_late(rest: str, marks: list[str]) -> bool:
+    return rest.lower().endswith(VIDEOS) and marks[0].isdecimal()
+
+
+def _promise(path: Path, size: int) -> None:
+    partial = path.with_name(f".{path.name}.promised")
+    partial.touch()
+    os.truncate(partial, size)
+    os.utime(partial, (0, 0))
+    partial.replace(path)
+
+
+@functools.lru_cache(maxsize=2)
+def _listing(path: Path) -> tuple[str, Mapping[str, list[str]]]:
+    content = json.loads(path.read_bytes())
+    return content["url"], content["marks"]
+
+
+def _unwritable(folder: Path, error: OSError) -> DataError:
+    where = f"cannot write to {folder} ({error.strerror})"
+    return DataError(f"{where}: make room, or set {remote.CACHE} to another folder")
+
+
+def _listed(url: str) -> Marks:
     system, root = remote.located(url)
     try:
-        found = system.find(root, detail=True)
-        if not found and system.isfile(root):
-            found = {root: system.info(root)}
+        found = _found(system, root, url.startswith("http"))
     except FileNotFoundError:
         found = {}
     except Exception as error:  # every protocol has its own exceptions
@@ -63,12 +142,25 @@ def _listed(url: str) -> dict[str, Any]:
     if not found:
         raise DataError(f"there is nothing behind {url}")
     base = root.rstrip("/")
-    return {
-        name.removeprefix(base).lstrip("/"): [
-            str(facts.get(key, "")) for key in ("size", "ETag", "etag", "blob_id", "mtime")
-        ]
-        for name, facts in found.items()
-    }
+    return {name.removeprefix(base).lstrip("/"): _marks(facts) for name, facts in found.items()}
+
+
+def _found(system: Any, root: str, is_web: bool) -> dict[str, Any]:
+    """What the file system tells of each file."""
+    if is_web and system.info(root).get("mimetype") != "text/html":
+        return {root: system.info(root)}
+    found = system.find(root, detail=True)
+    if not found and system.isfile(root):
+        found = {root: system.info(root)}
+    if is_web:  # its pages name files, and nothing that tells a changed one
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            found = dict(zip(found, pool.map(system.info, found), strict=True))
+    return found
+
+
+def _marks(facts: Mapping[str, Any]) -> list[str]:
+    names = ("size", "ETag", "etag", "blob_id", "mtime", "Last-Modified")
+    return [str(facts.get(name, "")) for name in names]
 
 
 def _fetch_all(url: str, missing: dict[str, Path], progress: bool) -> None:
@@ -76,7 +168,7 @@ def _fetch_all(url: str, missing: dict[str, Path], progress: bool) -> None:
     from rich.progress import track
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        calls = [
+        calls: list[Any] = [
             pool.submit(remote.fetch, f"{url}/{rest}" if rest else url, path)
             for rest, path in missing.items()
         ]

@@ -91,18 +91,25 @@ def _staged(task: StageTask, recording: TimedRecording, episode: PlannedEpisode)
     """The name of the file of an episode, which is made if it is not there."""
     reading = task.reading
     stamps = [recording.cameras[name].stamp for name in reading.cameras]
+    labels = recording.labels if reading.instances else None
     about = repr((reading.key(recording, episode), stamps, task.fps, sorted(task.versions.items())))
+    about += repr(reading.instances) if labels else ""
     path = task.folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.zip"
     if path.exists():
         return path.name
     frames, count = reading.frames(recording, episode), len(episode.actions)
-    height, width = reading.size[0], reading.size[1] * len(reading.cameras)
+    size = (reading.size[0], reading.size[1] * len(reading.cameras))
+    masks, contacts = _no_masks(count, size, task.fps), np.zeros((0, 3), np.int32)
+    if labels:
+        shown = episode.frames[reading.cameras[0]]
+        contacts = labels.contacts_of(shown)
+        masks = encode_frames(labels.masks_of(shown, size), size, MASK, task.fps, count)
     members = {
-        "video.mkv": encode_frames(frames, (height, width), VIDEO, task.fps, KEYFRAMES),
-        "mask.mkv": _no_masks(count, (height, width), task.fps),
+        "video.mkv": encode_frames(frames, size, VIDEO, task.fps, KEYFRAMES),
+        "mask.mkv": masks,
         "actions.npy": to_npy(episode.actions),
         "states.npz": to_npz(episode.states),
-        "contacts.npy": to_npy(np.zeros((0, 3), np.int32)),
+        "contacts.npy": to_npy(contacts),
         "facts.json": json.dumps(dict(recording.facts)).encode(),
     }
     with writing(path), written_whole(path) as partial, zipfile.ZipFile(partial, "w") as archive:

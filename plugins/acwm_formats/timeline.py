@@ -21,6 +21,7 @@ from acwm_core.env.card import ActionKind, StateField
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError
 from acwm_formats.frames import ImageFrames
+from acwm_formats.labels import Labels
 
 
 class Frames(Protocol):
@@ -95,6 +96,7 @@ class TimedRecording:
         rate: frames per second that the source claims.
         length: number of frames that the source claims.
         facts: what else is known of the episode, for JSON: `task`, `reward`, …
+        labels: masks and contacts, if the frames are labelled.
     """
 
     name: str
@@ -104,6 +106,7 @@ class TimedRecording:
     rate: Fraction | None = None
     length: int | None = None
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    labels: Labels | None = None
 
 
 @dataclass(frozen=True)
@@ -200,6 +203,7 @@ class RecordedDataset:
             does.
         actions: what is known of the actions.
         state: the states to keep; None keeps all that the first recording has.
+        instances: names of the ids in masks, if recordings are labelled.
         size: frame size of a camera by default, as in `ImportOptions`.
         notes: sentences for people, kept in the card.
         seed: seed of the dataset, if the recordings were made with one.
@@ -220,6 +224,7 @@ class RecordedDataset:
     options: Mapping[str, object] | None = None
     actions: ActionFacts = ActionFacts()
     state: tuple[StateField, ...] | None = None
+    instances: tuple[str, ...] = ()
     size: int | tuple[int, int] | None = None
     notes: tuple[str, ...] = ()
     seed: int = 0

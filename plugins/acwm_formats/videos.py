@@ -17,6 +17,7 @@ from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
 from acwm_formats.names import exact, natural, word, words
+from acwm_formats.sources import VIDEOS
 from acwm_formats.tables import (
     EPISODES,
     FRAMES,
@@ -40,7 +41,6 @@ from acwm_formats.timeline import (
     first_sound,
 )
 
-VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".gif")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 

@@ -19,6 +19,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats import lerobot_export
+from acwm_formats.check import check_dataset
 from acwm_formats.format import export_dataset
 from acwm_formats.hdf5 import HDF5
 from acwm_formats.lerobot import LeRobot
@@ -105,6 +106,42 @@ def test_hdf5_keeps_every_bit(simulated, tmp_path):
                 assert json.loads(group.attrs["factors"]) == episode.factors
                 assert group.attrs["ood_label"] == (episode.ood_label or "")
                 assert json.loads(group.attrs["spec"]) == episode.spec.to_dict()
+
+
+def test_hdf5_comes_back_whole(simulated, tmp_path):
+    recorded = HDF5().read(export(simulated, tmp_path / "out", HDF5()))
+    card = imported(recorded, tmp_path / "back")
+    before = DatasetCard.read(simulated).environment
+    for name in ("name", "summary", "action", "state", "instances", "frame_size", "fps"):
+        assert getattr(card.environment, name) == getattr(before, name)
+    for split in card.splits:
+        ours, back = EpisodeDataset(simulated, split), EpisodeDataset(tmp_path / "back", split)
+        for index, (one, other) in enumerate(zip(ours, back, strict=True)):
+            for name in ("video", "masks", "actions", "contacts"):
+                np.testing.assert_array_equal(getattr(other, name), getattr(one, name))
+            assert other.masks.any()
+            for name, values in one.states.items():
+                np.testing.assert_array_equal(other.states[name], values)
+            about, facts = ours.about(index), back.about(index)["facts"]
+            assert facts["factors"] == about["factors"]
+            assert facts.get("ood_label") == about["ood_label"]
+    assert not [found for found in check_dataset(tmp_path / "back") if found.problem]
+    again = HDF5().read(export(tmp_path / "back", tmp_path / "again", HDF5()))
+    assert again.splits["train"][0].facts == recorded.splits["train"][0].facts
+
+
+def test_hdf5_of_another_size_or_cut_has_the_labels_that_fit(simulated, tmp_path):
+    recorded = HDF5().read(export(simulated, tmp_path / "out", HDF5()))
+    small = imported(recorded, tmp_path / "small", size=32)
+    assert small.environment.instances == ("unlabelled",)
+    assert any("Masks and contacts were left out" in note for note in small.source["notes"])
+    imported(recorded, tmp_path / "slow", fps=5)
+    one, half = (EpisodeDataset(path, "train")[0] for path in (simulated, tmp_path / "slow"))
+    np.testing.assert_array_equal(half.video, one.video[::2])
+    np.testing.assert_array_equal(half.masks, one.masks[::2])
+    wanted = one.contacts[one.contacts[:, 0] % 2 == 0]
+    np.testing.assert_array_equal(half.contacts, wanted // [2, 1, 1])
+    assert len(wanted)
 
 
 def test_lerobot_files_have_the_schema_of_version_3(lerobot, simulated):
