@@ -388,7 +388,8 @@ class _Import:
         if self.recorded.instances and not self.reading.instances:
             notes.append("Masks and contacts were left out, as they are of frames of another size.")
         if alignment.shift:
-            notes.append(f"Actions were moved by {alignment.shift} frames.")
+            unit = "frame" if abs(alignment.shift) == 1 else "frames"
+            notes.append(f"Actions were moved by {alignment.shift} {unit}.")
         told = [f"{each.name}: {note}" for each in kept for note in each.notes]
         told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
         others = [name for name in self.first.cameras if name not in self.reading.cameras]
