@@ -48,7 +48,7 @@ def print_summary(summary: Summary) -> None:
         "± is half the 95 % confidence interval over episodes; `other actions`: the model was "
         "given another episode's actions"
     )
-    if any(any(r.scores.shares.get("model", {})) for r in summary.splits.values()):
+    if any(r.scores.shares.get("model") for r in summary.splits.values()):
         click.echo(
             "scored: share of the bodies and frames in which the model shows what is measured"
         )
