@@ -19,15 +19,16 @@ from PIL import Image
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
-from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.results import SetSummary, Summary
+from acwm_core.evaluation.shares import error_shares
 from acwm_core.training.run import load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
 from acwm_formats.preview import Picture, below, beside, magnified
 from acwm_zoo.shipped import folder, shipped
 
 SPLITS = ("ind_test", "ood_test")
-COLUMNS = ("world", "trained on", "steps, CPU-hours", "PSNR, dB", "codec, dB", "response")
-COLUMNS += ("position or height error, mm", "permanence")
+COLUMNS = ("world", "trained on", "steps, CPU-hours", "PSNR, dB", "codec, dB", "other start, dB")
+COLUMNS += ("codec, world, model, %", "response", "position or height error, mm", "permanence")
 MOMENTS = 6
 """Number of square frames in a row; fewer if frames are wide."""
 
@@ -73,10 +74,19 @@ def row(name: str) -> list[str]:
         f"{facts['step'] + before['step']:,}, {seconds / 3600:.1f}",
         scores("psnr"),
         scores("psnr", "codec"),
+        scores("psnr", "perturbed"),
+        " / ".join(shares(summary.splits[split].scores) for split in SPLITS),
         " / ".join(f"{value:.2f}" for value in response if value is not None),
         scores("position_error", scale=1e3) or scores("height_error", scale=1e3),
         scores("permanence", digits=2),
     ]
+
+
+def shares(scores: SetSummary) -> str:
+    """The shares of the squared error of codec, world and model, in percent."""
+    found = error_shares(scores)
+    parts = (found.codec, found.world or 0, found.model) if found else ()
+    return ", ".join(f"{100 * part:.0f}" for part in parts)
 
 
 def strip(name: str) -> Picture:

@@ -174,6 +174,12 @@ def true_contacts(prediction: Prediction, gap: Gap) -> NDArray[np.bool_]:
     return touching
 
 
+def first_contact(prediction: Prediction) -> int:
+    """The frame of the first true contact that can be detected; T if there is none."""
+    begun = [each.true[0] for each in onsets(prediction) if len(each.true)]
+    return int(min(begun, default=len(prediction.masks)))
+
+
 def beginnings(touching: NDArray[np.bool_]) -> NDArray[np.int64]:
     """The frames at which contacts begin, after at least `BREAK` frames without contact."""
     frames = np.flatnonzero(touching)

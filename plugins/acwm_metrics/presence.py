@@ -38,9 +38,7 @@ def presence(prediction: Prediction) -> dict[str, Mask]:
     """
     physics, masks = physics_of(prediction), seen_of(prediction).masks
     ids, areas, sizes = _areas(prediction)
-    before = np.array([*ids, *ids_of(prediction, physics.shapes)])
-    exist = sizes > 0
-    least = MIN_SHARE * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
+    before, exist, least = _in_front(prediction), sizes > 0, _least(sizes)
     movable = {name for reading in physics.readings for name in reading.instances}
     found: dict[str, Mask] = {}
     for k, (name, instance) in enumerate(zip(physics.objects, ids, strict=True)):
@@ -57,6 +55,29 @@ def presence(prediction: Prediction) -> dict[str, Mask]:
         else:
             found[name] = ~seen
     return found
+
+
+def parts_of(prediction: Prediction, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """The number of parts in which masks `[T, H, W]` show each object, `[T, objects]`."""
+    ids, _, sizes = _areas(prediction)
+    before = _in_front(prediction)
+    parts = [
+        pieces(masks, int(each), before[before != each], float(least))
+        for each, least in zip(ids, _least(sizes), strict=True)
+    ]
+    return np.stack(parts, 1)
+
+
+def _in_front(prediction: Prediction) -> NDArray[np.int64]:
+    """The ids of all that can be in front of something."""
+    physics = physics_of(prediction)
+    return ids_of(prediction, [*physics.objects, *physics.shapes])
+
+
+def _least(sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The area from which on an object is seen, `[n]`, from usual ones; 0 for those not there."""
+    exist = sizes > 0
+    return MIN_SHARE * np.where(exist, sizes, np.median(sizes[exist]) if exist.any() else np.inf)
 
 
 def out_of_sight(prediction: Prediction) -> Mask:

@@ -73,12 +73,15 @@ def contrast(video: NDArray[np.float32], own: Mask) -> NDArray[np.float64]:
     if not own.any():
         return np.full(len(own), np.nan)
     ring = np.asarray(ndimage.maximum_filter(own, (1, 5, 5)), np.bool_) & ~own
-    with np.errstate(invalid="ignore", divide="ignore"):
-        inside, around = (
-            np.einsum("tchw,thw->tc", video, part, dtype=np.float64) / part.sum((1, 2))[:, None]
-            for part in (own, ring)
-        )
+    inside, around = (mean_colour(video, part) for part in (own, ring))
     return np.sqrt(((inside - around) ** 2).mean(1))
+
+
+def mean_colour(video: NDArray[np.float32], own: Mask) -> NDArray[np.float64]:
+    """The mean colour of pixels `[T, H, W]` of a video `[T, 3, H, W]`, `[T, 3]`; NaN if none."""
+    sums = np.einsum("tchw,thw->tc", video, own, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return sums / own.sum((1, 2))[:, None]
 
 
 def held_of(prediction: Prediction) -> Observation:

@@ -15,6 +15,7 @@ from acwm_core.evaluation.results import (
     VideoRecord,
     defined,
 )
+from acwm_core.evaluation.shares import error_shares
 from acwm_core.evaluation.views import metric_and_view, of_view
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
@@ -27,7 +28,8 @@ from acwm_report.videos import EmbeddedVideo
 def score_tables(run: EvaluatedRun) -> list[Table]:
     """One table per split: the scores of every evaluation row in the pixel metrics.
 
-    Out of distribution, a further row shows the change. Where a frame shows several views, the same
+    The caption says how much of the squared error is the codec's, the world's and the model's. Out
+    of distribution, a further row shows the change. Where a frame shows several views, the same
     rows follow for each. If there are no pixel metrics, all metrics are shown.
     """
     metrics = run.summary.metrics
@@ -38,8 +40,9 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
     for split, result in run.summary.splits.items():
         views = dict.fromkeys(view for _, view in places)
         rows = [row for view in views for row in _score_rows(run, split, scales, view)]
-        title = _title(split, result)
-        tables.append(Table(title, columns, rows, "Prediction", name=f"scores-{split}"))
+        title, parts = _title(split, result), error_shares(result.scores)
+        about = f"Roughly, {parts}." if parts else ""
+        tables.append(Table(title, columns, rows, "Prediction", about, f"scores-{split}"))
     return tables
 
 

@@ -34,6 +34,10 @@ SHORT = {"In distribution": "InD", "Out of distribution": "OoD"}
 """Short names of splits, for tables whose eight columns must fit a terminal."""
 
 
+MUCH = 1 / 3
+"""Share of the squared error from which on a better codec is worth a word."""
+
+
 def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and published scores for comparison."""
     from rich.console import Console
@@ -62,7 +66,11 @@ def print_summary(summary: Summary) -> None:
 
 
 def _print_remarks(scores: SetSummary) -> None:
-    """Print which predictions failed, and which scores are left out of the means above."""
+    """Print who makes the error, which predictions failed, and which scores are left out."""
+    from acwm_core.evaluation.shares import error_shares
+
+    if found := error_shares(scores):
+        click.echo(f"{found}{': see `acwm train-codec`' if found.codec > MUCH else ''}")
     for row in scores.failed:
         failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"
         click.echo(f"{failures}: their scores count as infinitely bad")

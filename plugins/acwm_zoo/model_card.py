@@ -12,11 +12,20 @@ from typing import Any
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import Estimate, Summary
+from acwm_core.evaluation.shares import error_shares
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import read_metadata
 from acwm_core.training.run_folder import RunFolder
 
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
+
+ROWS = {
+    "model": "model",
+    "codec": "codec alone",
+    "perturbed": "simulator from a slightly different start",
+    "copy": "first frame",
+}
+"""The rows that stand beside each other at the end of a card."""
 
 CURVE_POINTS = 8
 """Number of training steps in the card's learning curve."""
@@ -67,7 +76,8 @@ A world model of `{environment.name}`: from the first frames and actions it pred
 {_episodes(summary)}, as the weights are stored here, with 95 % intervals. `acwm evaluate {name}`
 makes the same numbers again.
 
-{_scores(summary)}"""
+{_scores(summary)}
+{_ceilings(summary)}"""
 
 
 def _hours(facts: dict[str, Any]) -> str:
@@ -133,6 +143,18 @@ def _scores(summary: Summary) -> str:
         cells = (_shown(each.rows["model"].get(name)) if each else "" for each in asked)
         lines.append([f"action {name}", *cells])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _ceilings(summary: Summary) -> str:
+    """What the headline metric could be, and who makes the squared error; a line per split."""
+    lines: list[str] = []
+    for split, result in summary.splits.items():
+        rows = {row: found.get(summary.headline) for row, found in result.scores.rows.items()}
+        beside = [f"{title} {_shown(rows[row])}" for row, title in ROWS.items() if row in rows]
+        text = f"{summary.metrics[summary.headline].title} {SPLITS.get(split, split)}: "
+        parts = error_shares(result.scores)
+        lines.append(f"- {text}{', '.join(beside)}{f'. Roughly, {parts}' if parts else ''}.\n")
+    return "".join(lines)
 
 
 def _shown(score: Estimate | None) -> str:

@@ -1,10 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from acwm_core.evaluation.metric import Metric
-from acwm_core.evaluation.results import Estimate, Score
+from acwm_core.evaluation.results import Estimate, Score, SetSummary
+from acwm_core.evaluation.shares import error_shares
 from acwm_core.evaluation.storage import read_scores, write_scores
 from acwm_core.evaluation.summarise import gap, horizon, summarise
 from acwm_metrics.pixel import PSNR
@@ -104,3 +106,25 @@ def test_results_survive_parquet(tmp_path):
     folder.mkdir()
     write_scores(folder / "episodes.parquet", results)
     assert read_scores(tmp_path) == results
+
+
+@pytest.mark.parametrize("metric", ["mse", "psnr"])
+def test_whose_the_squared_error_is(metric):
+    errors = {"model": 0.01, "codec": 0.0025, "perturbed": 0.001, "copy": 0.03}
+    values = {k: v if metric == "mse" else -10 * math.log10(v) for k, v in errors.items()}
+    rows = {kind: {metric: Estimate(value)} for kind, value in values.items()}
+    found = error_shares(SetSummary(1, rows, {}))
+    assert found is not None
+    assert (found.codec, found.world, found.model) == pytest.approx((0.25, 0.1, 0.65))
+    assert [part in str(found) for part in ("25 %", "10 %", "65 %")] == [True] * 3
+    del rows["perturbed"]
+    found = error_shares(SetSummary(1, rows, {}))
+    assert found is not None
+    assert (found.world, found.model) == (None, pytest.approx(0.75))
+    assert error_shares(SetSummary(1, {"model": {"ssim": Estimate(0.9)}}, {})) is None
+
+
+def test_shares_that_are_scored_are_means_over_clips():
+    given = (0.2, 0.8, math.nan)  # none where there was nothing to score
+    clips = [replace(clip(e, "model", 1.0), shares={"error": x}) for e, x in enumerate(given)]
+    assert summarise(clips, METRICS, 0).shares == {"model": {"error": 0.5}}

@@ -46,6 +46,11 @@ def vanishing(true, share=0.25):
     return torch.where(_after(true, share), 0, true)
 
 
+def stopped(true, share=0.25):
+    """Right for a quarter of the time; then it stands still."""
+    return true[torch.arange(len(true)).clamp(max=int(np.ceil(share * len(true))) - 1)]
+
+
 def emptied(true, share=0.5):
     """Right for half of the time; then what moves is gone."""
     return torch.where(_after(true, share), median(true)[1:2], true)
@@ -88,6 +93,7 @@ CRAFTED = {
         flickering,
         median,
         vanishing,
+        stopped,
         emptied,
         hazy,
         noisy,

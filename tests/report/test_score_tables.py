@@ -59,11 +59,11 @@ def test_there_is_none_without_metrics_of_pixels(tmp_path):
     assert main_table([replace(read, summary=replace(read.summary, metrics={}))]) is None
 
 
-class Sharpness(synthetic.Quality):
+class Acuity(synthetic.Quality):
     """A metric of pixels that core has never heard of."""
 
-    name = "sharpness"
-    title = "Sharpness"
+    name = "acuity"
+    title = "Acuity"
     unit = "lp/px"
 
 
@@ -71,19 +71,19 @@ def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monke
     """By what it says of itself; of a result that says nothing, by what is registered."""
     metrics = Catalog().registry("metric")
     metrics.registering("foreign", None)
-    metrics.add("sharpness", f"{__name__}:Sharpness")
+    metrics.add("acuity", f"{__name__}:Acuity")
     installed = SimpleNamespace(component=lambda kind, name: metrics[name])
     monkeypatch.setattr(runs, "catalog", lambda: installed)
     folder = synthetic.run(tmp_path / "run", synthetic.clips(SCORES))
     read = EvaluatedRun.read(folder, "run1")
     rows = read.summary.splits["ind_test"].scores.rows
     for row in rows.values():
-        row["sharpness"] = row["odd"] = row["psnr"]
-    for info in (Sharpness().info, MetricInfo("lp/px", higher_is_better=True)):
-        told = described({**read.summary.metrics, "sharpness": info, "odd": MetricInfo("", False)})
+        row["acuity"] = row["odd"] = row["psnr"]
+    for info in (Acuity().info, MetricInfo("lp/px", higher_is_better=True)):
+        told = described({**read.summary.metrics, "acuity": info, "odd": MetricInfo("", False)})
         found = replace(read, summary=replace(read.summary, metrics=told))
         (scores,), (states,) = score_tables(found), state_tables(found)
         heads = [(each.title, each.unit, each.better) for each in scores.columns]
-        assert ("Sharpness", "lp/px", "↑") in heads
-        assert [column.key for column in main_table([found]).columns][-1] == "ind_test_sharpness"
+        assert ("Acuity", "lp/px", "↑") in heads
+        assert [column.key for column in main_table([found]).columns][-1] == "ind_test_acuity"
         assert [row.title for row in states.rows] == ["ODD"]
