@@ -5,29 +5,23 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.generate import fill
-from acwm_core.env.card import ActionSpec, plain_rate
-from acwm_core.env.environment import EnvironmentCard, StateField
+from acwm_core.env.card import plain_rate
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import LocalExecutor, progress_bar
 from acwm_core.files import held, writing, written_whole
-from acwm_formats.alignment import Alignment, Defect
-from acwm_formats.bounds import action_bounds, beyond, outliers
+from acwm_formats.alignment import Defect
 from acwm_formats.cadence import QUARTER, SAME, common_rate
+from acwm_formats.import_cards import Described, few
 from acwm_formats.reading import (
     ImportOptions,
     Reading,
@@ -43,47 +37,12 @@ from acwm_formats.reading import (
 from acwm_formats.staging import ORDER, STAGING, Staged, StagedEpisodes, StageTask, stage
 from acwm_formats.timeline import RecordedDataset, Recordings, TimedRecording
 
-UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
-MOST_TOLD = 50  # notes and defects that are told one by one
 ROWS = 1_000_000  # about how many rows of actions are looked at for their bounds
 AT_ONCE = 64  # recordings that one task looks at
 MOST_TOGETHER = 16  # recordings that one task decodes, if there are thousands
 
 Parts = Mapping[Split, tuple[Recordings, Sequence[int]]]
 """The recordings of each split, and the places in them of those that belong to it."""
-
-
-def recorded_card(
-    name: str,
-    action: ActionSpec,
-    *,
-    frame_size: tuple[int, int],
-    fps: float | Fraction,
-    horizon: int,
-    state: Sequence[StateField] = (),
-    summary: str = "",
-    engine: str = "recorded",
-    citation: str = "",
-    views: tuple[str, ...] = (),
-    instances: tuple[str, ...] = (),
-) -> EnvironmentCard:
-    """The environment card of recorded data: no factors, no simulator, often no instances."""
-    unseen = "" if instances else UNSEEN
-    return EnvironmentCard(
-        name=name,
-        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {unseen}".removeprefix(". ").strip(),
-        action=action,
-        frame_size=frame_size,
-        fps=plain_rate(fps),
-        horizon=horizon,
-        factors=(),
-        ood_shifts=(),
-        state=tuple(state),
-        instances=instances or ("unlabelled",),  # every pixel of such masks has id 0
-        engine=engine,
-        citation=citation,
-        views=views,
-    )
 
 
 def import_dataset(
@@ -155,6 +114,11 @@ class _Import:
     executor: LocalExecutor
     progress: bool
 
+    @property
+    def described(self) -> Described:
+        """What is written about it."""
+        return Described(self.recorded, self.options, self.reading, tuple(self.first.cameras))
+
     def run(self, shard_episodes: int) -> DatasetCard:
         """Look, decode, and fill the folder."""
         scans = [] if self.recorded.costly else self._looked_at()
@@ -176,7 +140,7 @@ class _Import:
             staged = self._decoded(fps, {place for place, defects in bad.items() if defects})
             kept, skipped = self._sound(bad, staged)
             scans = [each.scan for each in kept]
-            card = self._card(fps, plan, shard_episodes, scans, skipped)
+            card = self.described.card(fps, plan, shard_episodes, scans, skipped)
             made = self._filled(card, kept)
         shutil.rmtree(staging, ignore_errors=True)
         return made
@@ -189,7 +153,7 @@ class _Import:
                 "skip": "these recordings are left out",
                 "trim": "their sound parts are kept",
             }[self.options.alignment.on_defect]
-            lines = "\n".join(f"  {line}" for line in _few([str(each) for each in defects]))
+            lines = "\n".join(f"  {line}" for line in few([str(each) for each in defects]))
             print(f"found without decoding ({end}):\n{lines}", file=sys.stderr, flush=True)
 
     def _looked_at(self) -> list[Scan]:
@@ -241,16 +205,10 @@ class _Import:
         there = DatasetCard.read(self.out)
         if there.source.get("plan") == plan and set(there.checksums) == set(there.splits):
             return there
-        now = replace(there, source={**there.source, **self.recorded.facts, **self._command()})
+        now = replace(
+            there, source={**there.source, **self.recorded.facts, **self.described.command()}
+        )
         raise other_dataset(self.out, there.differences(now) or ["its recordings have changed"])
-
-    def _command(self) -> dict[str, str]:
-        """The command that imports the same again, if there is one."""
-        if self.recorded.options is None:
-            return {}
-        kind, name = (str(self.recorded.facts[key]) for key in ("kind", "name"))
-        options = {**self.recorded.options, **self._words()}
-        return {"command": import_command(kind, name, **options)}
 
     def _decoded(self, fps: float, bad: set[tuple[str, int]]) -> list[Staged]:
         versions = package_versions()
@@ -310,112 +268,12 @@ class _Import:
             count = sum(len(places) for _, places in self.parts.values())
             wrong = sum(1 for some in defects.values() if some)
             choice = "; --on-defect skip imports the others" if kept else ""
-            listed = "\n".join(f"  {line}" for line in _few(told))
+            listed = "\n".join(f"  {line}" for line in few(told))
             raise DataError(f"{wrong} of {count} recordings have defects{choice}\n{listed}")
         places = {(each.scan.split, each.scan.index) for each in kept}
         return kept, [
             str(d) for place, some in defects.items() if place not in places for d in some
         ]
-
-    def _card(
-        self,
-        fps: float,
-        plan: str,
-        shard_episodes: int,
-        kept: Sequence[Scan],
-        skipped: Sequence[str] = (),
-    ) -> DatasetCard:
-        """The card of the dataset that holds the recordings `kept`."""
-        rows = {split: _rows([k for k in kept if k.split == split]) for split in self.parts}
-        basis = rows.get("train", np.zeros((0, 0), np.float32))
-        action = self._action(basis if len(basis) else np.concatenate([*rows.values()]))
-        counts: dict[Split, int] = {
-            s: sum(len(k.lengths) for k in kept if k.split == s) for s in SPLITS
-        }
-        size = self.reading.size
-        environment = recorded_card(
-            self.options.environment or self.recorded.name,
-            action,
-            frame_size=(size[0], size[1] * len(self.reading.cameras)),
-            fps=fps,
-            horizon=max(length for each in kept for length in each.lengths),
-            state=self.reading.state,
-            summary=self.recorded.summary,
-            engine=self.recorded.engine,
-            citation=self.recorded.citation,
-            views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
-            instances=self.reading.instances,
-        )
-        told = {"plan": plan, "notes": self._notes(kept, rows, action)}
-        source = {**self.recorded.facts, **told, **self._command()}
-        if skipped:
-            source["skipped"] = list(_few(skipped))
-        return DatasetCard(
-            environment=environment,
-            splits={split: count for split, count in counts.items() if count},
-            seed=self.recorded.seed,
-            options={"size": list(environment.frame_size)},
-            factors={},
-            shard_episodes=shard_episodes,
-            versions=package_versions(),
-            source=source,
-        )
-
-    def _action(self, rows: NDArray[np.float32]) -> ActionSpec:
-        """What the actions are, with bounds of `rows` if none are stated."""
-        action, kinds = self.reading.action, self.options.alignment.kinds
-        action = replace(action, kind=max(kinds, key=kinds.count))
-        if self.reading.stated:
-            return action
-        low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
-        if self.recorded.actions.bounds is not None:
-            low, high = np.minimum(low, action.low), np.maximum(high, action.high)
-        return replace(action, low=tuple(low.tolist()), high=tuple(high.tolist()))
-
-    def _notes(
-        self, kept: Sequence[Scan], rows: Mapping[str, NDArray[np.float32]], action: ActionSpec
-    ) -> list[str]:
-        """What people should know about the dataset."""
-        notes, alignment = [*self.recorded.notes], self.options.alignment
-        if self.recorded.actions.bounds is None:
-            quantile = self.options.bounds == "quantile"
-            which = "the range but for a hundredth at either end" if quantile else "the range"
-            notes.append(f"The bounds of actions are {which} of the training episodes.")
-            if not quantile and "train" in rows:
-                notes += outliers(rows["train"], action.names)
-        for split, some in rows.items():
-            notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
-        if self.recorded.instances and not self.reading.instances:
-            notes.append("Masks and contacts were left out, as they are of frames of another size.")
-        if alignment.shift:
-            unit = "frame" if abs(alignment.shift) == 1 else "frames"
-            notes.append(f"Actions were moved by {alignment.shift} {unit}.")
-        told = [f"{each.name}: {note}" for each in kept for note in each.notes]
-        told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
-        others = [name for name in self.first.cameras if name not in self.reading.cameras]
-        if others:
-            notes.append(f"Frames of {self.reading.cameras[0]}; other cameras: {', '.join(others)}")
-        return [*notes, *_few(told)]
-
-    def _words(self) -> dict[str, object]:
-        """The options of the command that imports the same again."""
-        asked, alignment, usual = self.options, self.options.alignment, Alignment()
-        several = len(self.first.cameras) > 1
-        height, width = self.reading.size
-        words: dict[str, object] = {
-            "camera": list(self.reading.cameras) if several else None,
-            "size": f"{height}x{width}",
-            "environment": asked.environment,
-            "test_episodes": asked.test_episodes,
-            "bounds": None if asked.bounds == "range" else asked.bounds,
-            "depth_range": asked.depth_range
-            and ",".join(f"{each:g}" for each in asked.depth_range),
-        }
-        kinds = ",".join(alignment.kinds)
-        words["action_kind"] = None if kinds == self.recorded.actions.kind else kinds
-        names = ("fps", "tolerance", "max_gap", "shift", "on_defect")
-        changed = {name: getattr(alignment, name) for name in names}
-        return words | {n: v for n, v in changed.items() if v != getattr(usual, n)}
 
     def _filled(self, card: DatasetCard, kept: Sequence[Staged]) -> DatasetCard:
         """Fill the shards with the staged episodes."""
@@ -457,36 +315,9 @@ def _picked(recordings: Recordings, places: Sequence[int]) -> Recordings:
     return part(places) if part else recordings
 
 
-def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
-    """Rows of the actions of some recordings ``[N, A]``."""
-    rows = [each.actions for each in kept if len(each.actions)]
-    return np.concatenate(rows) if rows else np.zeros((0, 0), np.float32)
-
-
-def _few(lines: Sequence[str]) -> Sequence[str]:
-    if len(lines) <= MOST_TOLD:
-        return lines
-    return [*lines[:MOST_TOLD], f"and {len(lines) - MOST_TOLD} more"]
-
-
 def _refuse_other_files(out: Path) -> None:
     names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
     if names and not (out / STAGING).exists():
         raise DataError(
             f"{out} holds other files ({names[0]}) and no dataset: choose another --out"
         )
-
-
-def import_command(kind: str, name: str, **options: object) -> str:
-    """The command ``acwm data import KIND NAME --option value …``.
-
-    Options of None or False are left out, and one of True has no value.
-    """
-    words = ["acwm", "data", "import", kind, name]
-    for option, value in options.items():
-        for each in value if isinstance(value, list) else [value]:  # pyright: ignore
-            if each is None or each is False:
-                continue
-            size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else str(each)
-            words += [f"--{option.replace('_', '-')}", *([] if each is True else [size])]
-    return shlex.join(words)

@@ -1,0 +1,208 @@
+"""What is written about imported recordings: the dataset's card, notes, and the command."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.card import DatasetCard, package_versions
+from acwm_core.env.card import ActionSpec, plain_rate
+from acwm_core.env.environment import EnvironmentCard, StateField
+from acwm_core.env.episode import SPLITS, Split
+from acwm_formats.alignment import Alignment
+from acwm_formats.bounds import action_bounds, beyond, outliers
+from acwm_formats.reading import ImportOptions, Reading, Scan
+from acwm_formats.timeline import RecordedDataset
+
+UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
+MOST_TOLD = 50  # notes and defects that are told one by one
+
+
+def recorded_card(
+    name: str,
+    action: ActionSpec,
+    *,
+    frame_size: tuple[int, int],
+    fps: float | Fraction,
+    horizon: int,
+    state: Sequence[StateField] = (),
+    summary: str = "",
+    engine: str = "recorded",
+    citation: str = "",
+    views: tuple[str, ...] = (),
+    instances: tuple[str, ...] = (),
+) -> EnvironmentCard:
+    """The environment card of recorded data: no factors, no simulator, often no instances."""
+    unseen = "" if instances else UNSEEN
+    return EnvironmentCard(
+        name=name,
+        summary=f"{summary.removesuffix(UNSEEN).rstrip('. ')}. {unseen}".removeprefix(". ").strip(),
+        action=action,
+        frame_size=frame_size,
+        fps=plain_rate(fps),
+        horizon=horizon,
+        factors=(),
+        ood_shifts=(),
+        state=tuple(state),
+        instances=instances or ("unlabelled",),  # every pixel of such masks has id 0
+        engine=engine,
+        citation=citation,
+        views=views,
+    )
+
+
+@dataclass(frozen=True)
+class Described:
+    """What is known of an import before its recordings are decoded.
+
+    Attributes:
+        cameras: all that the recordings have.
+    """
+
+    recorded: RecordedDataset
+    options: ImportOptions
+    reading: Reading
+    cameras: tuple[str, ...]
+
+    def command(self) -> dict[str, str]:
+        """The command that imports the same again, if there is one."""
+        if self.recorded.options is None:
+            return {}
+        kind, name = (str(self.recorded.facts[key]) for key in ("kind", "name"))
+        options = {**self.recorded.options, **self._words()}
+        return {"command": import_command(kind, name, **options)}
+
+    def card(
+        self,
+        fps: float,
+        plan: str,
+        shard_episodes: int,
+        kept: Sequence[Scan],
+        skipped: Sequence[str] = (),
+    ) -> DatasetCard:
+        """The card of the dataset that holds the recordings `kept`."""
+        present = [split for split in SPLITS if any(each.split == split for each in kept)]
+        rows = {split: _rows([k for k in kept if k.split == split]) for split in present}
+        basis = rows.get("train", np.zeros((0, 0), np.float32))
+        action = self._action(basis if len(basis) else np.concatenate([*rows.values()]))
+        counts: dict[Split, int] = {
+            s: sum(len(k.lengths) for k in kept if k.split == s) for s in SPLITS
+        }
+        size = self.reading.size
+        environment = recorded_card(
+            self.options.environment or self.recorded.name,
+            action,
+            frame_size=(size[0], size[1] * len(self.reading.cameras)),
+            fps=fps,
+            horizon=max(length for each in kept for length in each.lengths),
+            state=self.reading.state,
+            summary=self.recorded.summary,
+            engine=self.recorded.engine,
+            citation=self.recorded.citation,
+            views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
+            instances=self.reading.instances,
+        )
+        told = {"plan": plan, "notes": self._notes(kept, rows, action)}
+        source = {**self.recorded.facts, **told, **self.command()}
+        if skipped:
+            source["skipped"] = list(few(skipped))
+        return DatasetCard(
+            environment=environment,
+            splits={split: count for split, count in counts.items() if count},
+            seed=self.recorded.seed,
+            options={"size": list(environment.frame_size)},
+            factors={},
+            shard_episodes=shard_episodes,
+            versions=package_versions(),
+            source=source,
+        )
+
+    def _action(self, rows: NDArray[np.float32]) -> ActionSpec:
+        """What the actions are, with bounds of `rows` if none are stated."""
+        action, kinds = self.reading.action, self.options.alignment.kinds
+        action = replace(action, kind=max(kinds, key=kinds.count))
+        if self.reading.stated:
+            return action
+        low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
+        if self.recorded.actions.bounds is not None:
+            low, high = np.minimum(low, action.low), np.maximum(high, action.high)
+        return replace(action, low=tuple(low.tolist()), high=tuple(high.tolist()))
+
+    def _notes(
+        self, kept: Sequence[Scan], rows: Mapping[str, NDArray[np.float32]], action: ActionSpec
+    ) -> list[str]:
+        """What people should know about the dataset."""
+        notes, alignment = [*self.recorded.notes], self.options.alignment
+        if self.recorded.actions.bounds is None:
+            quantile = self.options.bounds == "quantile"
+            which = "the range but for a hundredth at either end" if quantile else "the range"
+            notes.append(f"The bounds of actions are {which} of the training episodes.")
+            if not quantile and "train" in rows:
+                notes += outliers(rows["train"], action.names)
+        for split, some in rows.items():
+            notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
+        if self.recorded.instances and not self.reading.instances:
+            notes.append("Masks and contacts were left out, as they are of frames of another size.")
+        if alignment.shift:
+            unit = "frame" if abs(alignment.shift) == 1 else "frames"
+            notes.append(f"Actions were moved by {alignment.shift} {unit}.")
+        told = [f"{each.name}: {note}" for each in kept for note in each.notes]
+        told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
+        others = [name for name in self.cameras if name not in self.reading.cameras]
+        if others:
+            notes.append(f"Frames of {self.reading.cameras[0]}; other cameras: {', '.join(others)}")
+        return [*notes, *few(told)]
+
+    def _words(self) -> dict[str, object]:
+        """The options of the command that imports the same again."""
+        asked, alignment, usual = self.options, self.options.alignment, Alignment()
+        several = len(self.cameras) > 1
+        height, width = self.reading.size
+        words: dict[str, object] = {
+            "camera": list(self.reading.cameras) if several else None,
+            "size": f"{height}x{width}",
+            "environment": asked.environment,
+            "test_episodes": asked.test_episodes,
+            "bounds": None if asked.bounds == "range" else asked.bounds,
+            "depth_range": asked.depth_range
+            and ",".join(f"{each:g}" for each in asked.depth_range),
+        }
+        kinds = ",".join(alignment.kinds)
+        words["action_kind"] = None if kinds == self.recorded.actions.kind else kinds
+        names = ("fps", "tolerance", "max_gap", "shift", "on_defect")
+        changed = {name: getattr(alignment, name) for name in names}
+        return words | {n: v for n, v in changed.items() if v != getattr(usual, n)}
+
+
+def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
+    """Rows of the actions of some recordings ``[N, A]``."""
+    rows = [each.actions for each in kept if len(each.actions)]
+    return np.concatenate(rows) if rows else np.zeros((0, 0), np.float32)
+
+
+def few(lines: Sequence[str]) -> Sequence[str]:
+    """The lines, or the first of them and how many more there are."""
+    if len(lines) <= MOST_TOLD:
+        return lines
+    return [*lines[:MOST_TOLD], f"and {len(lines) - MOST_TOLD} more"]
+
+
+def import_command(kind: str, name: str, **options: object) -> str:
+    """The command ``acwm data import KIND NAME --option value …``.
+
+    Options of None or False are left out, and one of True has no value.
+    """
+    words = ["acwm", "data", "import", kind, name]
+    for option, value in options.items():
+        for each in value if isinstance(value, list) else [value]:  # pyright: ignore
+            if each is None or each is False:
+                continue
+            size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else str(each)
+            words += [f"--{option.replace('_', '-')}", *([] if each is True else [size])]
+    return shlex.join(words)
