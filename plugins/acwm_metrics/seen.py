@@ -99,6 +99,8 @@ def _held(prediction: Prediction) -> Observation:
     for reading in physics_of(prediction).readings:
         missing = ~found(seen, reading)
         fill = missing & shown(prediction, reading.instances)
+        for frame in range(1, len(fill)):  # what vanished in sight is lost until it is found again
+            fill[frame] |= missing[frame] & fill[frame - 1]
         if fill.any():
             states[reading.field] = values = np.array(states[reading.field], np.float64)
             bodies, start = by_body(values, reading), prediction.states[reading.field][:1]
