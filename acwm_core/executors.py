@@ -219,14 +219,19 @@ class _WorkerContext(ForkServerContext):
     Process = _Worker
 
 
+_server_of: int | None = None
+"""The process that started the server."""
+
+
 def worker_context(*preload: str) -> ForkServerContext | SpawnContext:
     """How worker processes are started.
 
     Simulators and threads of this process do not survive a fork. So workers are forked from a
-    server, a process that does nothing but import the modules `preload`, and only once; or begin as
-    new processes where frameworks of the system bear no fork (macOS, Windows).
+    server, a process that does nothing but import the modules `preload`, and only once. They begin
+    as new processes where frameworks of the system bear no fork (macOS, Windows), and in a process
+    that was forked itself, as its server is not its child.
     """
-    if sys.platform != "linux":
+    if sys.platform != "linux" or _server_of not in (None, os.getpid()):
         return SpawnContext()
     context = _WorkerContext()
     context.set_forkserver_preload(["__main__", *preload])
@@ -244,6 +249,8 @@ def without_interrupts(context: BaseContext) -> Generator[None]:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         if isinstance(context, ForkServerContext):
+            global _server_of
+            _server_of = os.getpid()
             forkserver.ensure_running()
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import sys
 from collections.abc import Iterator, Sequence
@@ -165,14 +166,14 @@ class ClipLoader:
         pin_memory: bool = False,
     ) -> None:
         streams = isinstance(clips, IterableDataset)
-        self._context = worker_context(__name__)
+        self._context = worker_context(__name__) if workers else None
         self.order = sampler
         self._loader: DataLoader[Any] = DataLoader(
             clips if streams else _Batches(clips),
             batch_size=None,
             sampler=None if streams else sampler,
             num_workers=workers,
-            multiprocessing_context=self._context if workers else None,
+            multiprocessing_context=self._context,
             pin_memory=pin_memory,
         )
 
@@ -186,7 +187,7 @@ class ClipLoader:
         Raises:
             DataError: a shard is missing or damaged, or a worker died.
         """
-        with without_interrupts(self._context):
+        with without_interrupts(self._context) if self._context else contextlib.nullcontext():
             batches = iter(self._loader)
         places = self.order.places()
         while True:

@@ -259,6 +259,19 @@ def test_workers_have_the_variables_of_the_shell_as_they_are_now(monkeypatch):
         assert found == [value] * 2
 
 
+def test_a_process_that_was_forked_has_workers_of_its_own():
+    numbers = [1, 2, 3]
+    assert sorted(LocalExecutor(2).run(_double, numbers, lambda units: None)) == [2, 4, 6]
+    child = os.fork()
+    if not child:
+        try:
+            found = sorted(LocalExecutor(2).run(_double, numbers, lambda units: None))
+            os._exit(0 if found == [2, 4, 6] else 2)
+        finally:
+            os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
 def test_the_bar_tells_rate_and_remaining_time_of_what_was_missing(monkeypatch):
     """Ten episodes were there; the others take a minute and a half each."""
     screen, now = io.StringIO(), [1000.0]

@@ -42,7 +42,10 @@ def test_killed_by_sigkill_it_resumes_on_the_same_curve(whole, data, tmp_path, m
     recipe = tiny_recipe(data, trainer={"callbacks": [callback("Die", batch=10)]})
     child = os.fork()
     if not child:
-        fit(recipe, tmp_path / "run")
+        try:
+            fit(recipe, tmp_path / "run")
+        finally:
+            os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     monkeypatch.setenv("SPARED", "1")
     assert_same(whole, RunFolder(fit(recipe, "", resume=tmp_path / "run")))
