@@ -203,13 +203,17 @@ class LocalExecutor(Executor):
 
 
 class _Worker(ForkServerProcess):
-    """A process forked from the server, with the variables of the shell as they are now."""
+    """A process forked from the server, with the variables of the shell as they are now.
+
+    Ctrl-C is for the process that started it.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._environment = dict(os.environ)
 
     def run(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.environ.clear()  # that of the moment when the server was started
         os.environ.update(self._environment)
         super().run()

@@ -80,6 +80,7 @@ def test_its_run_is_reported(folder, tmp_path):
     assert "23.26" in page.read_text()  # psnr_mean in distribution
 
 
+@pytest.mark.ci
 def test_its_run_gets_the_same_scores(folder, before):
     run = folder / "run"
     data = ["--data", str(folder / "data")]

@@ -10,6 +10,8 @@ from tests.formats.corpus import arrays, files, logs
 from tests.formats.corpus.every import ACTIONS, CASES, PIXELS, RATES
 from tests.formats.corpus.pictures import number_in
 
+pytestmark = pytest.mark.ci
+
 WRITERS = {
     "videos": files.videos,
     "lerobot": files.lerobot,

@@ -17,6 +17,8 @@ from acwm_planning.policies.table import summarise
 from acwm_planning.resumable import ResumableResults
 from tests import tiny
 
+pytestmark = pytest.mark.ci
+
 SEEDS = range(6)
 
 

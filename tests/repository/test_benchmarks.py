@@ -38,6 +38,7 @@ def test_every_named_environment_gets_a_row():
     assert "2,187 episodes of 1 world" in done.stdout
 
 
+@pytest.mark.ci
 def test_what_cannot_be_measured_is_named():
     done = table("push_cubes")
     assert done.returncode == 1

@@ -33,7 +33,7 @@ WORLDS = {
 """What draws scores of so many episodes, and the true summary."""
 
 
-@pytest.mark.parametrize("episodes", [8, 20, 64])
+@pytest.mark.parametrize("episodes", [8, pytest.param(20, marks=pytest.mark.ci), 64])
 @pytest.mark.parametrize("world", WORLDS)
 def test_intervals_hold_the_truth_in_nineteen_of_twenty_cases(world, episodes):
     draw, truth = WORLDS[world]

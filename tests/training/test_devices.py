@@ -170,6 +170,7 @@ def test_layers_that_are_computed_again_train_the_same(more_runs):
     assert_close(more_runs["one"], more_runs["recomputed"])
 
 
+@pytest.mark.ci
 def test_sharded_runs_resume_exactly(runs):
     """After a SIGTERM that one of the two received."""
     assert_same(runs["fsdp"], runs["stopped"])
