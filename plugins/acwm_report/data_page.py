@@ -159,8 +159,8 @@ def _frame_table(found: Survey) -> Table:
     return Table("", columns, rows, "Frames that are", "", "frames")
 
 
-def needs_table() -> Table | None:
-    """How good `small` became with how much data; None until it is measured.
+def needs_table() -> Table:
+    """How good `small` became with how much data.
 
     It is read from ``needs.yaml``, a list of rows with `world`, `episodes`, `psnr` (dB) and
     `response`, and optionally the same two from a shipped model as a start, `psnr_started` and
@@ -168,25 +168,26 @@ def needs_table() -> Table | None:
     """
     text = resources.files("acwm_report").joinpath("needs.yaml").read_text("utf-8")
     measured: Sequence[dict[str, Any]] = yaml.safe_load(text)["rows"]
-    if not measured:
-        return None
     names = ("psnr", "response", "psnr_started", "response_started")
-    used = [name for name in names if any(name in row for row in measured)]
-    titles = {"psnr": "PSNR", "response": "Response"}
-    columns = [Column("Episodes")]
-    for name in used:
-        key, _, started = name.partition("_")
-        group = "from a shipped model" if started else "from nothing"
-        columns.append(Column(titles[key], "dB" if key == "psnr" else "", "↑", group))
-    rows = [
-        Row(
-            "",
-            [
-                Cell(f"{row['episodes']:,}"),
-                *(Cell(f"{row[name]:.2f}" if name in row else MISSING) for name in used),
-            ],
-            group=row["world"],
-        )
+    found = {
+        (row["episodes"], row["world"], name): f"{row[name]:.2f}"
         for row in measured
+        for name in names
+        if name in row
+    }
+    places = [
+        (world, name)
+        for world in dict.fromkeys(row["world"] for row in measured)
+        for name in names
+        if any(key[1:] == (world, name) for key in found)
     ]
-    return Table("", columns, rows, "World", "", "needs")
+    columns: list[Column] = []
+    for world, name in places:
+        key, _, started = name.partition("_")
+        title, unit = ("PSNR", "dB") if key == "psnr" else ("Response", "")
+        columns.append(Column(f"{title}, {started}" if started else title, unit, "↑", world))
+    rows = [
+        Row(f"{count:,}", [Cell(found.get((count, *place), MISSING)) for place in places])
+        for count in sorted({row["episodes"] for row in measured})
+    ]
+    return Table("", columns, rows, "Episodes", "", "needs")
