@@ -35,10 +35,10 @@ class State(NamedTuple):
 class RecurrentModel(Predictor):
     """Unrolls a state from the given latent frame, one step per latent frame.
 
-    The state has two parts. The grid has the same cells as the latent; the coordinates of the cells
-    are among its inputs. The vector is updated by a GRU from the embedded actions and the pooled
-    grid. Residual convolution blocks, modulated by the vector, update the grid. A predicted frame
-    is the given frame plus what a last convolution reads from the grid.
+    The state has two parts. The grid has a cell for each patch of the latent; the coordinates of
+    the cells are among its inputs. The vector is updated by a GRU from the embedded actions and the
+    pooled grid. Residual convolution blocks, modulated by the vector, update the grid. A predicted
+    frame is the given frame plus what a last convolution reads from the grid.
 
     With several given frames it starts from the last one and from the change just before it, which
     shows velocities.
@@ -48,6 +48,7 @@ class RecurrentModel(Predictor):
         channels: channels of the grid.
         width: size of the vector and of the conditioner's modulation.
         blocks: number of residual blocks per step.
+        patch_size: side of a patch in latent pixels.
 
     Raises:
         RecipeError: a size below 1.
@@ -57,21 +58,31 @@ class RecurrentModel(Predictor):
     causal = streams = True
 
     def __init__(
-        self, *, latent_channels: int, channels: int = 64, width: int = 192, blocks: int = 2
+        self,
+        *,
+        latent_channels: int,
+        channels: int = 64,
+        width: int = 192,
+        blocks: int = 2,
+        patch_size: int = 1,
     ) -> None:
         super().__init__()
-        if min(channels, width, blocks) < 1:
-            raise RecipeError("channels, width and blocks of a recurrent model must be at least 1")
+        if min(channels, width, blocks, patch_size) < 1:
+            raise RecipeError(
+                "channels, width, blocks and patch_size of a recurrent model must be at least 1"
+            )
         self.latent_channels = latent_channels
         self.width = width
-        self.stem = nn.Conv2d(2 * latent_channels + 2, channels, 3, padding=1)
+        self.patch_size = patch_size
+        patch_values = latent_channels * patch_size**2
+        self.stem = nn.Conv2d(2 * patch_values + 2, channels, 3, padding=1)
         self.start_vector = nn.Linear(channels * START_CELLS**2, width)
         self.start_block = FilmBlock(channels, width)
         self.read_grid = nn.Linear(channels * STEP_CELLS**2, width)
         self.gru = nn.GRUCell(2 * width, width)
         self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
         self.head = MatrixConv(channels, channels)
-        self.out = nn.Conv2d(channels, latent_channels, 1)
+        self.out = nn.Conv2d(channels, patch_values, 1)
         for parameter in self.out.parameters():
             nn.init.zeros_(parameter)
 
@@ -108,9 +119,16 @@ class RecurrentModel(Predictor):
             raise ShapeError(
                 f"RecurrentModel takes latents [B, L, {self.latent_channels}, h, w], not {shape}"
             )
+        if shape[3] % self.patch_size or shape[4] % self.patch_size:
+            raise ShapeError(
+                f"RecurrentModel cuts latents into patches of {self.patch_size}, which "
+                f"{shape[3]}×{shape[4]} does not divide into; choose another frame size or "
+                "patch_size=1"
+            )
         base = given[:, -1]
         change = base - given[:, -2] if shape[1] > 1 else torch.zeros_like(base)
-        grid = self.stem(torch.cat([base, change, _coordinates(base)], 1))
+        cells = functional.pixel_unshuffle(torch.cat([base, change], 1), self.patch_size)
+        grid = self.stem(torch.cat([cells, _coordinates(cells)], 1))
         grid = grid.contiguous(memory_format=torch.channels_last)
         pooled = functional.adaptive_avg_pool2d(grid, START_CELLS).flatten(1)
         vector = torch.tanh(self.start_vector(pooled) + first)
@@ -150,7 +168,8 @@ class RecurrentModel(Predictor):
 
     def _read(self, grid: Tensor) -> Tensor:
         grid = grid.contiguous(memory_format=torch.channels_last)
-        return self.out(functional.silu(self.head(channel_norm(grid))))
+        cells = self.out(functional.silu(self.head(channel_norm(grid))))
+        return functional.pixel_shuffle(cells, self.patch_size)
 
     def actions(self, conditioning: Conditioning) -> Tensor:
         """The embedded actions `[B, L, width]`.
@@ -182,8 +201,8 @@ class _RecurrentStream(LatentStream):
         return latent
 
 
-def _coordinates(latent: Tensor) -> Tensor:
+def _coordinates(cells: Tensor) -> Tensor:
     """Row and column of each cell, scaled to [−1, 1]: `[B, 2, h, w]`."""
-    rows, columns = (torch.linspace(-1, 1, n, device=latent.device) for n in latent.shape[-2:])
+    rows, columns = (torch.linspace(-1, 1, n, device=cells.device) for n in cells.shape[-2:])
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
-    return grid.to(latent.dtype).expand(len(latent), -1, -1, -1)
+    return grid.to(cells.dtype).expand(len(cells), -1, -1, -1)

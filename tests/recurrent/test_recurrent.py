@@ -112,6 +112,24 @@ def test_a_fresh_model_repeats_the_given_frame():
     torch.testing.assert_close(predicted, given.expand(-1, 4, -1, -1, -1))
 
 
+def test_patches_are_cells_of_a_coarser_latent():
+    torch.manual_seed(0)
+    patched = RecurrentModel(latent_channels=3, channels=8, width=16, patch_size=2)
+    coarse = RecurrentModel(latent_channels=12, channels=8, width=16)
+    for parameter in patched.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    coarse.load_state_dict(patched.state_dict())
+    given, conditioning = (
+        torch.randn(2, 2, 3, 8, 4),
+        Conditioning(torch.randn(2, 5, 16), None, None),
+    )
+    predicted = patched(given, conditioning, 5)
+    folded = coarse(functional.pixel_unshuffle(given, 2), conditioning, 5)
+    torch.testing.assert_close(functional.pixel_unshuffle(predicted, 2), folded)
+    with pytest.raises(ShapeError, match=r"patches of 2, which 7×4"):
+        patched(given[..., :7, :], conditioning, 5)
+
+
 def drifting(batch, seed):
     """Latents `[B, 6, 1, 4, 4]`, each changing at a speed of its own that no action tells."""
     generator = torch.Generator().manual_seed(seed)
