@@ -3,6 +3,7 @@
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from tests.formats.test_from_lerobot import REFERENCE
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
 TAKES = Case("takes", three(), names=("take 1", "take 2", "take 3"), column="time")
+LARGE = replace(TAKES, size=(96, 128))
+"""As a camera takes them: larger than a small model's frames."""
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def desk(tmp_path, monkeypatch):
     release.environment(Path("release/kinematics/reacher"), length=5)
     for folder, write in (("takes", files.videos), ("logs", logs.in_ros2)):
         Path(folder).mkdir()
-        write(Path(folder), TAKES)
+        write(Path(folder), LARGE if folder == "takes" else TAKES)
     for write, name in (
         (arrays.robomimic, "demo.hdf5"),
         (arrays.mapped, "mine.h5"),
