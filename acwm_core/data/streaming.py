@@ -1,12 +1,14 @@
 """`ClipStream`: clips from streamed shards, for datasets larger than the disk.
 
-It is a webdataset pipeline. Each worker of each rank has its own shards, in a new order in every
-pass, and draws the next clip from a buffer of compressed episodes. Of a dataset behind a URL, the
-disk holds one shard per worker. The stream has no position, so it cannot be resumed exactly.
+In every pass, the shards are dealt anew to the readers, i.e. the workers of all ranks, so that
+clips are seen equally often. A reader draws the next clip from a buffer of compressed episodes. Of
+a dataset behind a URL, the disk holds one shard per reader. The stream has no position, so it
+cannot be resumed exactly.
 """
 
 from __future__ import annotations
 
+import heapq
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -21,7 +23,7 @@ from torch.utils import data as torch_data
 
 from acwm_core.data.clips import ClipDataset, window_actions
 from acwm_core.data.dataset import window_into
-from acwm_core.data.loader import ClipSampler
+from acwm_core.data.loader import ClipSampler, epoch_order
 from acwm_core.data.shards import damaged_shard
 from acwm_core.errors import DataError
 
@@ -45,57 +47,53 @@ class ClipStream(torch_data.IterableDataset[Any]):
     Args:
         clips: which clips; only their shards are read, each when its turn comes.
         sampler: its `batch_size`, `seed`, `rank` and `world_size` count, not its order.
-        shuffle_buffer: size of each worker's buffer, in clips, from which the next one is drawn.
-        workers: the loader's; 0 reads in its process.
-
-    Raises:
-        DataError: there are fewer shards than processes to read them.
+        shuffle_buffer: size of each reader's buffer, in clips, from which the next one is drawn.
     """
 
     def __init__(
-        self,
-        clips: ClipDataset,
-        sampler: ClipSampler,
-        *,
-        shuffle_buffer: int = 2000,
-        workers: int = 0,
+        self, clips: ClipDataset, sampler: ClipSampler, *, shuffle_buffer: int = 2000
     ) -> None:
         self.clips, self.sampler, self.shuffle_buffer = clips, sampler, shuffle_buffer
         episodes: list[int] = clips.windows[:, 0].tolist()
         self._shard_of = np.array([clips.episodes.shard_of(each) for each in episodes])
-        self._shards: list[int] = np.unique(self._shard_of).tolist()
         self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clip length
-        shards, readers = len(self._shards), sampler.world_size * max(1, workers)
-        if shards < readers:
-            raise DataError(
-                f"data.reader=webdataset needs a shard for each of {readers} processes that read, "
-                f"not {shards} in all: set fewer data.workers, or data.reader=random_access"
-            )
 
     def __iter__(self) -> Iterator[Any]:
         """Yield batches; a `DataError` is the last item, as in `ClipLoader`."""
         import webdataset  # pyright: ignore[reportMissingTypeStubs]
 
-        wds, everything = cast(Any, webdataset), len(self._shards)
-        seed, own = self.sampler.seed, self._shards[self.sampler.rank :: self.sampler.world_size]
-        pipeline = wds.DataPipeline(
-            wds.SimpleShardList([str(number) for number in own]),
-            wds.split_by_worker,
-            wds.detshuffle(everything, initial=everything, seed=seed),
-            self._windows,
-            wds.detshuffle(self.shuffle_buffer, initial=self.shuffle_buffer, seed=seed),
-            self._batches,
-        ).repeat()
+        worker = torch_data.get_worker_info()
+        workers, own = (worker.num_workers, worker.id) if worker else (1, 0)
+        own += self.sampler.rank * workers
+        size, seed = self.shuffle_buffer, self.sampler.seed
         try:
-            yield from pipeline
+            for number, shares in enumerate(self._passes(self.sampler.world_size * workers)):
+                windows = self._windows(shares[own])
+                buffer = cast(Any, webdataset).detshuffle(size, size, seed, epoch=number - 1)
+                yield from self._batches(buffer.run(windows))
         except DataError as error:
             yield error
 
-    def _windows(self, shards: Iterable[dict[str, str]]) -> Iterator[_Window]:
+    def _passes(self, readers: int) -> Iterator[list[list[int]]]:
+        """The shards of each reader in each pass; the next one goes to who had the fewest clips.
+
+        Readers take clips at the same rate. So whatever shards hold, and however few they are, no
+        reader is ahead by more than one shard.
+        """
+        shards, clips = np.unique(self._shard_of, return_counts=True)
+        dealt = [(0, reader) for reader in range(readers)]
+        for number in itertools.count():
+            shares: list[list[int]] = [[] for _ in range(readers)]
+            for place in epoch_order(len(shards), self.sampler.seed, number):
+                before, reader = dealt[0]
+                shares[reader].append(int(shards[place]))
+                heapq.heapreplace(dealt, (before + int(clips[place]), reader))
+            yield shares
+
+    def _windows(self, shards: Iterable[int]) -> Iterator[_Window]:
         clips, episodes = self.clips, self.clips.episodes
         owners: list[int] = clips.windows[:, 0].tolist()
-        for shard in shards:
-            number = int(shard["url"])
+        for number in shards:
             rows = np.flatnonzero(self._shard_of == number)
             with episodes.passing_shard(number) as reader:
                 for episode, group in itertools.groupby(rows, owners.__getitem__):

@@ -106,9 +106,7 @@ class ClipData(L.LightningDataModule):
         sampler.position = trainer.global_step * self.clips_per_step
         clips = self._train
         if self._streams and isinstance(clips, ClipDataset):
-            clips = ClipStream(
-                clips, sampler, shuffle_buffer=config.shuffle_buffer, workers=config.workers
-            )
+            clips = ClipStream(clips, sampler, shuffle_buffer=config.shuffle_buffer)
         on_gpu = trainer.strategy.root_device.type == "cuda"
         return ClipLoader(clips, sampler, workers=config.workers, pin_memory=on_gpu)
 
