@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
-from acwm_core.checks.result import NotTried, Suite, expect, expect_equal
+from acwm_core.checks.result import NotTried, Suite, expect, expect_equal, expect_is_a
 from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment, EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
@@ -197,18 +198,20 @@ class PredictionTrial(Suite):
         modulation: Tensor,
         probe: Probe | None = None,
         steps: int | None = None,
+        first: int = 0,
     ) -> Latent:
-        """Predict clips as long as the modulation."""
-        clips, frames = batch_of(given, modulation, probe), modulation.shape[1]
+        """Predict clips as long as the modulation, with the noise of clip number `first` and on."""
+        clips, frames = batch_of(given, modulation, probe, first), modulation.shape[1]
         return self._objective.predict(self._model, clips, frames, steps)
 
     @torch.no_grad()
-    def _streamed(self, known: int) -> Latent:
+    def _streamed(self, known: int, first: int = 0) -> Latent:
         """The frames of a stream after `known` given ones; not tried if it refuses to stream."""
         latents, modulation = self._inputs()
         given, frames, objective = latents[:, :known], latents.shape[1], self._objective
         try:
-            stream = objective.stream(self._model, given, draws(len(given)), context=frames)
+            noises = draws(len(given), first)
+            stream = objective.stream(self._model, given, noises, context=frames)
         except RecipeError as error:
             default = objective.streams_by_default(self._model)
             expect(not default, "it refuses to stream, which it says is its default")
@@ -231,6 +234,20 @@ class PredictionTrial(Suite):
             expect_equal("predicts", [*predicted.shape], [*latents.shape])
             expect(predicted.isfinite().all(), "the prediction is not finite")
             expect(torch.equal(predicted[:, :known], given), "the given frames come out changed")
+
+    def draws_from_the_generators_if_it_says_so(self) -> None:
+        """Predict and stream the same with the same generators; with others iff not `samples`."""
+        latents, modulation = self._inputs()
+        seeds, samples = (0, 0, 100), self._model.samples
+        expect_is_a(samples, bool)
+        made = {"prediction": [self._predict(latents[:, :1], modulation, first=s) for s in seeds]}
+        with contextlib.suppress(NotTried):
+            made["stream"] = [self._streamed(1, first=s) for s in seeds]
+        for what, (once, again, other) in made.items():
+            expect(torch.equal(once, again), f"generators do not decide its {what}")
+            same = torch.equal(once, other)
+            expect(not (same and samples), f"its {what} ignores generators, but samples is true")
+            expect(same or samples, f"its {what} depends on generators, but samples is false")
 
 
 class DenoisingTrial(DiffusionForcing):

@@ -38,12 +38,15 @@ class DynamicsModel(nn.Module, ABC):
             modulation.
         heads: number of attention heads, passed to the conditioner; divides all `widths`.
         causal: whether the prediction of a latent frame depends on no later frame.
+        samples: whether a prediction depends on the clip's noise generator, so that other seeds
+            give other futures. Otherwise there is one future for all seeds.
     """
 
     width: int
     layers: int
     heads: int
     causal: bool = False
+    samples: bool = False
 
     @functools.cached_property
     def widths(self) -> tuple[int, ...]:
@@ -71,6 +74,7 @@ class Denoiser(DynamicsModel):
         inputs: the further inputs that `forward` and `extend` take, by name.
     """
 
+    samples = True
     inputs: Mapping[str, InputKind] = {}
 
     @abstractmethod
@@ -131,7 +135,11 @@ class Denoiser(DynamicsModel):
 
 
 class Predictor(DynamicsModel):
-    """A network that computes the frames after the given ones at once, without noise.
+    """A network that computes the frames after the given ones at once, without noise to remove.
+
+    One that draws a future (`samples`) takes the further keyword ``generators`` in `forward` and in
+    `stream`: one CPU generator per clip, its only source of randomness. Its stream draws as
+    `forward` does, so that the future stays the same one.
 
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.

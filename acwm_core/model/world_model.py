@@ -88,6 +88,11 @@ class WorldModel(nn.Module):
             return "windows"
         return "stream"
 
+    @property
+    def samples(self) -> bool:
+        """Whether seeds matter: it draws one of several futures; see `DynamicsModel.samples`."""
+        return self.model.samples
+
     def matrices(self) -> list[nn.Parameter]:
         """The hidden weight matrices of model and conditioner, for optimisers such as Muon."""
         return [*(self.model.matrices() or []), *hidden_matrices(self.conditioner)]

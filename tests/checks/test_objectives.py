@@ -102,6 +102,12 @@ class AlwaysOneStep(Flawed):
         return super().sample(evaluate, noise, given, 1)
 
 
+@FLAWS.caught_by("draws from the generators if it says so", "ignores generators")
+class OneNoiseForAll(Flawed):
+    def sample(self, evaluate, noise, given, steps=None):
+        return super().sample(evaluate, torch.zeros_like(noise), given, steps)
+
+
 @FLAWS.caught_by("streams or refuses to", "says is its default")
 class OnlySaysThatItStreams(Regression):
     def stream(self, model, given, generators, *, steps=None, context):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import check_shape
-from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Latent
@@ -26,16 +27,15 @@ class Regression(Objective[Predictor]):
     def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
         given, true = batch.latents[:, :known], batch.latents[:, known:]
-        predicted = _predicted(model, given, batch.conditioning, batch.latents.shape[1])
+        predicted = _predicted(model, replace(batch, latents=given), batch.latents.shape[1])
         return functional.mse_loss(predicted.float(), true.float())
 
     def predict(
         self, model: Predictor, given: Batch, frames: int, steps: int | None = None
     ) -> Latent:
-        """Predict the clip in one pass, without noise; see `Objective.predict`."""
+        """Predict the clip in one pass; see `Objective.predict`."""
         latents = given.latents
-        predicted = _predicted(model, latents, given.conditioning, frames)
-        return torch.cat([latents, predicted.to(latents)], 1)
+        return torch.cat([latents, _predicted(model, given, frames).to(latents)], 1)
 
     def stream(
         self,
@@ -47,14 +47,21 @@ class Regression(Objective[Predictor]):
         context: int,
     ) -> LatentStream:
         """The model's own stream; see `Predictor.stream`."""
-        return model.stream(given, context=context)
+        return model.stream(given, context=context, **_drawing(model, generators))
 
     def streams_by_default(self, model: Predictor) -> bool:
         """Whether the model has a stream: it was trained to carry its state over the clip."""
         return model.streams
 
 
-def _predicted(model: Predictor, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
-    made = model(given, conditioning, frames)
-    check_shape(model, "forward", made, len(given), frames - given.shape[1], *given.shape[2:])
+def _predicted(model: Predictor, given: Batch, frames: int) -> Latent:
+    batch, known, *size = given.latents.shape
+    drawing = _drawing(model, given.generators)
+    made = model(given.latents, given.conditioning, frames, **drawing)
+    check_shape(model, "forward", made, batch, frames - known, *size)
     return made
+
+
+def _drawing(model: Predictor, generators: Sequence[torch.Generator]) -> dict[str, Any]:
+    """The further argument of a predictor that draws."""
+    return {"generators": generators} if model.samples else {}
