@@ -132,6 +132,8 @@ def counterfactual(
     videos: list[ShownClip] = []
     for branches, truth in simulated:
         for row in ROWS:
+            if row not in evaluator.rows:
+                continue
             with noting(truth.clip.where, *evaluator.world_model.children()):
                 prediction = _predicted(evaluator, truth, row)
                 responses.add(row, branches, prediction)

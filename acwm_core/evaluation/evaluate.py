@@ -1,4 +1,4 @@
-"""`evaluate_run`: from a run folder to scores of every test clip."""
+"""`evaluate_run`: from a run folder to scores of every test clip; `evaluate_clips`: from others."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import shutil
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 
@@ -20,12 +20,12 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.evaluation.clips import plan_clips
+from acwm_core.evaluation.clips import PREDICTORS, Predictor, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
-from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.protocol import published_for
-from acwm_core.evaluation.provenance import provenance
+from acwm_core.evaluation.predict import Evaluator, VideoModel
+from acwm_core.evaluation.protocol import Published, published_for
+from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary
 from acwm_core.evaluation.score import build_metrics, estimator_for, split_available
@@ -43,6 +43,21 @@ from acwm_core.files import held, writing, written_whole
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, run_to_write
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """What is evaluated, as its results tell it.
+
+    Attributes:
+        parts: see `Summary.parts`.
+        facts: what predicted, for `Summary.provenance`.
+        published: see `Summary.published`.
+    """
+
+    parts: dict[str, str]
+    facts: dict[str, Any]
+    published: Published | None = None
 
 
 def evaluate_run(
@@ -80,13 +95,35 @@ def evaluate_run(
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
     place = data or dataset_of(folder, recipe)
-    datasets = _open_splits(place, evaluator.config.splits, evaluator.card)
+    datasets = open_splits(place, evaluator.config.splits, evaluator.card)
+    named = ("codec", "model", "conditioner")
+    parts = {"env": evaluator.card.name, **{name: getattr(recipe, name).name for name in named}}
+    published = published_for({**parts, "fraction": recipe.data["fraction"]})
+    entrant = Entrant(parts, run_facts(folder, recipe, evaluator), published)
     home = results_folder(folder, out)
+    return evaluate_clips(
+        evaluator, datasets, home, entrant, overwrite=overwrite, progress=progress
+    )
+
+
+def evaluate_clips(
+    evaluator: Evaluator,
+    datasets: Mapping[str, EpisodeDataset],
+    home: Path,
+    entrant: Entrant,
+    *,
+    overwrite: bool,
+    progress: bool,
+) -> Summary:
+    """Predict and score the test clips of these splits, and write the results to `home`.
+
+    The other arguments are those of `evaluate_run`.
+    """
     with held(home):
         if not overwrite:
             checksums = {split: each.checksum for split, each in datasets.items()}
             refuse_other_result(home / SUMMARY, evaluator.config, checksums, OF_SWEEPS)
-        return _evaluate(folder, recipe, evaluator, datasets, home, progress)
+        return _evaluate(evaluator, datasets, home, entrant, progress)
 
 
 def results_folder(run: RunFolder, out: str | Path | None) -> Path:
@@ -102,11 +139,10 @@ def results_folder(run: RunFolder, out: str | Path | None) -> Path:
 
 
 def _evaluate(
-    folder: RunFolder,
-    recipe: Recipe,
     evaluator: Evaluator,
     datasets: Mapping[str, EpisodeDataset],
     home: Path,
+    entrant: Entrant,
     progress: bool,
 ) -> Summary:
     started, config = time.monotonic(), evaluator.config
@@ -122,9 +158,9 @@ def _evaluate(
     videos = [v for s in datasets for v in evaluator.videos(clips[s], datasets[s], scores[s])]
     videos += found.videos
     scores = {split: [*each, *found.scores.get(split, ())] for split, each in scores.items()}
-    summary = _summarise(home, recipe, evaluator, scores, sweeps, found)
+    summary = _summarise(home, entrant, evaluator, scores, sweeps, found)
     summary.videos.extend(record for record, _ in videos)
-    summary.provenance.update(provenance(folder, recipe, evaluator, datasets))
+    summary.provenance.update(provenance(evaluator, datasets, entrant.facts))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(home, summary, scores, videos)
     return summary
@@ -141,27 +177,39 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
             )
     recipe = compose(folder.recipe, overrides, sections=["evaluation"])
     config = EvaluationConfig(**recipe.evaluation)
+    world_model = bundle.world_model.to(choose_device(config.device))
+    return recipe, evaluator_of(world_model, bundle.card, config)
+
+
+def evaluator_of(
+    world_model: VideoModel,
+    card: EnvironmentCard,
+    config: EvaluationConfig,
+    rows: Sequence[Predictor] = PREDICTORS,
+) -> Evaluator:
+    """An `Evaluator` with the metrics of `config` that can be measured here."""
     if not config.metrics:
         raise RecipeError(
             "evaluation.metrics must name at least one: let the recipe extend base.yaml, which "
             "lists the usual ones, or add evaluation.metrics=[NAME] (see `acwm list metric`)"
         )
-    estimator = estimator_for(bundle.card)
+    estimator = estimator_for(card)
     metrics, left_out = split_available(
-        build_metrics(config.metrics, config.metric_options), bundle.card, estimator
+        build_metrics(config.metrics, config.metric_options), card, estimator
     )
-    of_views, too_small = metrics_of_views(metrics, bundle.card)
-    return recipe, Evaluator(
-        bundle.world_model.to(choose_device(config.device)),
-        bundle.card,
+    of_views, too_small = metrics_of_views(metrics, card)
+    return Evaluator(
+        world_model,
+        card,
         {**metrics, **of_views},
         config,
         estimator=estimator,
         left_out={**left_out, **too_small},
+        rows=rows,
     )
 
 
-def _open_splits(
+def open_splits(
     path: str | Path, splits: Sequence[str] | None, card: EnvironmentCard
 ) -> dict[str, EpisodeDataset]:
     """Open the splits of a data folder, by default the test splits; `card` is the run's card."""
@@ -225,7 +273,7 @@ def choose_device(name: str, option: str = "evaluation.device=") -> torch.device
 
 def _summarise(
     home: Path,
-    recipe: Recipe,
+    entrant: Entrant,
     evaluator: Evaluator,
     scores: Mapping[str, list[Score]],
     sweeps: Mapping[str, Mapping[int, list[Score]]],
@@ -234,11 +282,9 @@ def _summarise(
     """The summary of all splits, without videos and provenance."""
     metrics, config, card = evaluator.metrics, evaluator.config, evaluator.card
     inside, outside = scores.get("ind_test"), scores.get("ood_test")
-    named = ("codec", "model", "conditioner")
-    parts = {"env": card.name, **{name: getattr(recipe, name).name for name in named}}
     return Summary(
         run=home.resolve().parent.name,
-        parts=parts,
+        parts=entrant.parts,
         metrics={name: metric.info for name, metric in metrics.items()},
         headline=evaluator.headline,
         splits={
@@ -257,7 +303,7 @@ def _summarise(
         },
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},
-        published=published_for({**parts, "fraction": recipe.data["fraction"]}),
+        published=entrant.published,
     )
 
 

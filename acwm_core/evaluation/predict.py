@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,8 +34,48 @@ from acwm_core.evaluation.score import (
     score,
 )
 from acwm_core.evaluation.videos import ShownClip, pick_clips, shown
-from acwm_core.model.shapes import Video
-from acwm_core.model.world_model import WorldModel
+from acwm_core.model.shapes import Actions, Video
+from acwm_core.model.world_model import Mode
+
+
+class Reconstruction(Protocol):
+    """What is done to frames on their way through a model, such as its codec."""
+
+    def __call__(self, video: Video, /) -> Video:
+        """The frames after it."""
+        ...
+
+    def fingerprint(self) -> str:
+        """What it depends on."""
+        ...
+
+
+class VideoModel(Protocol):
+    """What an evaluation asks of a model: a `WorldModel`, or predictions that were made elsewhere.
+
+    Attributes are those of `WorldModel`.
+    """
+
+    @property
+    def context_frames(self) -> int: ...  # noqa: D102
+    @property
+    def clip_frames(self) -> int: ...  # noqa: D102
+    @property
+    def steps(self) -> int | None: ...  # noqa: D102
+    @property
+    def device(self) -> torch.device: ...  # noqa: D102
+    @property
+    def codec(self) -> Reconstruction: ...  # noqa: D102
+    def children(self) -> Iterable[object]: ...  # noqa: D102
+    def rollout_chunks(  # noqa: D102
+        self,
+        given: Video,
+        actions: Actions,
+        *,
+        mode: Mode | None,
+        steps: int | None,
+        seeds: Sequence[int] | None,
+    ) -> Iterator[Video]: ...
 
 
 @dataclass(frozen=True)
@@ -48,15 +89,17 @@ class Evaluator:
         config: the settings.
         estimator: reads states from video for the metrics; None if there is none.
         left_out: metrics that cannot be measured here, and why.
+        rows: what can predict here; all of `PREDICTORS` by default.
         advance: progress callback, called with the number of newly scored predictions.
     """
 
-    world_model: WorldModel
+    world_model: VideoModel
     card: EnvironmentCard
     metrics: Mapping[str, Metric]
     config: EvaluationConfig
     estimator: StateEstimator | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    rows: Sequence[Predictor] = PREDICTORS
     advance: Callable[[int], None] = lambda count: None
 
     @property
@@ -68,7 +111,7 @@ class Evaluator:
     def predictors(self) -> tuple[Predictor, ...]:
         """The rows that `scores` predicts; ``truth`` only if a metric reads states from video."""
         reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
-        return tuple(each for each in PREDICTORS if reads or each != "truth")
+        return tuple(each for each in self.rows if reads or each != "truth")
 
     @property
     def given(self) -> int:
@@ -78,12 +121,12 @@ class Evaluator:
     @property
     def steps_sweep(self) -> tuple[int, ...]:
         """Numbers of sampling steps to compare; empty for a model without sampling steps."""
-        return self.config.steps_sweep if self.world_model.objective.steps else ()
+        return self.config.steps_sweep if self.world_model.steps else ()
 
     @property
     def device(self) -> torch.device:
         """The device on which the model runs."""
-        return self.world_model.action_low.device
+        return self.world_model.device
 
     def truths(self, clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[Prediction]:
         """The true video of each clip, as a prediction of itself."""
@@ -196,7 +239,8 @@ class Evaluator:
         higher = self.metrics[self.headline].higher_is_better
         for place, pick in pick_clips(scores, self.headline, higher, self.config.videos).items():
             clip = by_place[place]
-            kinds: list[Predictor] = ["model", "shuffled"] if pick == "median" else ["model"]
+            wanted = ("model", "shuffled") if pick == "median" else ("model",)
+            kinds: list[Predictor] = [each for each in wanted if each in self.rows]
             (made,) = self.predictions([clip], episodes, kinds)
             for each in made:
                 actions = each.actions

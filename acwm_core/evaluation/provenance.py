@@ -6,7 +6,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -15,34 +15,46 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import file_sha256
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.score import measure_facts
+from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import read_metadata
 from acwm_core.training.run_folder import RunFolder
 
 
-def provenance(
-    folder: RunFolder, recipe: Recipe, evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset]
-) -> dict[str, Any]:
-    """Everything needed to reproduce the results, as JSON types."""
-    world_model, config, device = evaluator.world_model, evaluator.config, evaluator.device
-    dataset = next(iter(datasets.values()))
-    card = dataset.card
+def run_facts(folder: RunFolder, recipe: Recipe, evaluator: Evaluator) -> dict[str, Any]:
+    """What predicted, if it is the model of a run, as JSON types."""
+    world_model, config = cast(WorldModel, evaluator.world_model), evaluator.config
     facts = read_metadata(folder.weights)
-    machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
-    on_gpu = device.type == "cuda"
     trained = [*world_model.model.parameters(), *world_model.conditioner.parameters()]
     return {
-        "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
         "recipe_sha256": file_sha256(folder.recipe),
         "recipe": recipe.to_yaml(),
         "weights_sha256": file_sha256(folder.weights),
         "training_steps": facts["step"],
         "imported": facts.get("imported"),
         "parameters": sum(parameter.numel() for parameter in trained),
-        "codec_fingerprint": world_model.codec.fingerprint(),
-        "evaluation": asdict(config),
-        "sampling_steps": config.steps or world_model.objective.steps or 1,
+        "sampling_steps": config.steps or world_model.steps or 1,
         "mode": config.mode or world_model.mode,
+    }
+
+
+def provenance(
+    evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset], predictor: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Everything needed to reproduce the results, as JSON types.
+
+    Args:
+        predictor: what predicted, see `run_facts`.
+    """
+    dataset = next(iter(datasets.values()))
+    card, device = dataset.card, evaluator.device
+    machine = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
+    on_gpu = device.type == "cuda"
+    return {
+        "evaluated": datetime.now(UTC).isoformat(timespec="seconds"),
+        **predictor,
+        "codec_fingerprint": evaluator.world_model.codec.fingerprint(),
+        "evaluation": asdict(evaluator.config),
         "context_frames": evaluator.given,
         "dataset": {
             "path": str(dataset.path),

@@ -77,6 +77,16 @@ class WorldModel(nn.Module):
         return self
 
     @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return self.action_low.device
+
+    @property
+    def steps(self) -> int | None:
+        """Default number of network evaluations per window; None without sampling steps."""
+        return self.objective.steps
+
+    @property
     def mode(self) -> Mode:
         """Default mode of rollouts: "stream" if the model was trained for it, else "windows"."""
         streams = self.objective.streams_by_default(self.model)

@@ -16,7 +16,7 @@ from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
 from acwm_core.evaluation.interventions import simulator_of
 from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.provenance import provenance
+from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.storage import refuse_other_result
 from acwm_core.evaluation.summarise import summarise
@@ -89,7 +89,7 @@ def sweep_severity(
             headline=evaluator.headline,
             points=_points(evaluator, sweep, datasets, progress),
             left_out=list(sweep.left_out),
-            provenance=provenance(folder, recipe, evaluator, datasets),
+            provenance=provenance(evaluator, datasets, run_facts(folder, recipe, evaluator)),
         )
         write_json(home / f"{made.factor}.json", made)
         return made

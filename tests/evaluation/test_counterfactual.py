@@ -48,7 +48,7 @@ class Known:
             the prediction.
     """
 
-    action_low = torch.zeros(2)
+    device = torch.device("cpu")
 
     def __init__(self, environment, specs, predict):
         self.environment, self.specs, self.predict = environment, specs, predict

@@ -117,7 +117,7 @@ class Oracle(torch.nn.Module):
 
     def __init__(self, episodes):
         super().__init__()
-        self.register_buffer("action_low", torch.zeros(2))
+        self.device = torch.device("cpu")
         videos = [torch.tensor(e.video.transpose(0, 3, 1, 2)).float() / 255 for e in episodes]
         self.videos = videos
 
@@ -131,7 +131,7 @@ class Oracle(torch.nn.Module):
 
 
 def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
-    from acwm_core.evaluation.evaluate import _summarise, _write
+    from acwm_core.evaluation.evaluate import Entrant, _summarise, _write
 
     run = tiny.make_run(tmp_path / "oracle", data)
     bundle = load_run(run)
@@ -143,7 +143,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
     videos = evaluator.videos(plans, episodes, results["ind_test"])
     summary = _summarise(
         run / "evaluation",
-        bundle.recipe,
+        Entrant({"env": "drift", "codec": "blocks"}, {}),
         evaluator,
         results,
         {"ind_test": {}},
