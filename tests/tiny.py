@@ -466,7 +466,7 @@ def make_dataset(path, **episodes):
     return path
 
 
-def save_run(folder, recipe, card, step=1, change=lambda world_model: None):
+def save_run(folder, recipe, card, step=16, change=lambda world_model: None):
     """A run folder with fresh weights that `change` changes, as training would leave it."""
     folder.mkdir(parents=True)
     (folder / "recipe.yaml").write_text(recipe.to_yaml())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +20,7 @@ from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
-from acwm_core.errors import DataError, RecipeError
+from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.clips import PREDICTORS, Predictor, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
@@ -99,7 +100,16 @@ def evaluate_run(
     named = ("codec", "model", "conditioner")
     parts = {"env": evaluator.card.name, **{name: getattr(recipe, name).name for name in named}}
     published = published_for({**parts, "fraction": recipe.data["fraction"]})
-    entrant = Entrant(parts, run_facts(folder, recipe, evaluator), published)
+    facts = run_facts(folder, recipe, evaluator)
+    planned, done = recipe.trainer.get("max_steps") or 0, facts["training_steps"]
+    if done < planned:
+        warnings.warn(
+            f"{folder.path} is trained for {done:,} of its {planned:,} steps: these scores are of "
+            "an unfinished model",
+            AcwmWarning,
+            stacklevel=2,
+        )
+    entrant = Entrant(parts, facts, published)
     home = results_folder(folder, out)
     return evaluate_clips(
         evaluator, datasets, home, entrant, overwrite=overwrite, progress=progress

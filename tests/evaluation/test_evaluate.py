@@ -9,7 +9,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.errors import AcwmError, DataError, RecipeError, TrainingError
+from acwm_core.errors import AcwmError, AcwmWarning, DataError, RecipeError, TrainingError
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import choose_device, evaluate_run
@@ -202,6 +202,13 @@ def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
     files = {f.name for f in (run / "evaluation/videos").iterdir()}
     assert files == {v.file for v in Summary.read(run).videos}
     assert all(name.startswith("ind_test") for name in files)
+
+
+def test_it_is_told_when_the_training_is_not_at_its_end(data, tmp_path):
+    parts = {"trainer": {"max_steps": 16}}
+    run = tiny.make_run(tmp_path / "half", data, parts=parts, **FEW | {"videos": 0})
+    with pytest.warns(AcwmWarning, match="7 of its 16 steps"):
+        evaluate_run(run, progress=False)
 
 
 @pytest.mark.parametrize(
