@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,9 +10,6 @@ from typing import Any, cast
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
-from lightning.pytorch.loggers import TensorBoardLogger
-from PIL import Image
-from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
@@ -21,9 +17,9 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from acwm_core.errors import TrainingError
 from acwm_core.files import written_whole
-from acwm_core.model.shapes import Video
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import gradient_norm, total_norm
+from acwm_core.training.pictures import draw_strip, encode_gif, show_gif, show_picture
 from acwm_core.training.run import save_weights
 from acwm_core.training.run_folder import RunFolder
 
@@ -32,6 +28,9 @@ MAX_ROLLOUT_STEPS = 4
 
 MAX_PSNR = 80.0
 """PSNR in dB of equal clips, as in evaluation; otherwise it would be infinite."""
+
+
+STRIP = "validation: truth above prediction"
 
 
 class NanGuard(Callback):
@@ -147,7 +146,7 @@ class CpuTime(Callback):
 
 
 class SampleVideos(Callback):
-    """Writes predicted videos beside the truth to TensorBoard and to `samples/`, as GIFs.
+    """Writes predicted videos beside the truth to `samples/` and to loggers, as GIFs.
 
     Args:
         run: the run folder.
@@ -179,16 +178,11 @@ class SampleVideos(Callback):
 
     def _show(self, trainer: Trainer, gif: bytes) -> None:
         self._run.samples.mkdir(exist_ok=True)
-        with written_whole(self._run.samples / f"step-{trainer.global_step:07d}.gif") as partial:
+        path = self._run.samples / f"step-{trainer.global_step:07d}.gif"
+        with written_whole(path) as partial:
             partial.write_bytes(gif)
-        width, height = Image.open(io.BytesIO(gif)).size
-        make = cast(Any, summary_pb2).Summary  # generated code without type stubs
-        image = make.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
-        summary = make(value=[make.Value(tag="samples: truth | prediction", image=image)])
         for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                # The image tab plays GIFs; the writer's `add_video` would need moviepy.
-                cast(Any, logger).experiment.file_writer.add_summary(summary, trainer.global_step)
+            show_gif(logger, "samples: truth | prediction", path, trainer.global_step)
 
 
 class ValidationRollouts(Callback):
@@ -197,7 +191,8 @@ class ValidationRollouts(Callback):
     ``val/psnr`` is in dB, from the mean error of all pixels. ``val/ssim`` is from torchmetrics,
     which ignores the border of frames, with a uniform 7×7 window. ``val/psnr_over_first_frame`` is
     the PSNR minus that of repeating the first frame (the last context frame, if there are several).
-    A clip has the same noise every time, however many devices share the clips.
+    A clip has the same noise every time, however many devices share the clips. Loggers show a
+    strip of frames of the first clips.
 
     Args:
         video: true clips `[B, T, 3, H, W]`, uint8.
@@ -228,6 +223,10 @@ class ValidationRollouts(Callback):
             known = model.context_frames
             given = truth[:, :known]
             made = pl_module.rollout(given, actions, steps=steps, seeds=shown)
+            if trainer.is_global_zero:
+                strip = draw_strip(truth, made)
+                for logger in trainer.loggers:
+                    show_picture(logger, STRIP, strip, trainer.global_step)
             clips = (video[:, known - 1 :] for video in (truth, made.to(truth)))
             for place, true, made in zip(shown, *clips, strict=True):
                 if place in own:
@@ -239,17 +238,6 @@ class ValidationRollouts(Callback):
         pl_module.log("val/psnr", psnr, prog_bar=True, sync_dist=True)
         pl_module.log("val/ssim", ssim, sync_dist=True)
         pl_module.log("val/psnr_over_first_frame", psnr - still, sync_dist=True)
-
-
-def encode_gif(truth: Video, predicted: Video, fps: float) -> bytes:
-    """An endlessly looping GIF: one row per clip, truth on the left."""
-    pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
-    frames = (pairs.permute(1, 0, 3, 4, 2).flatten(1, 2) * 255).round().to(torch.uint8)
-    first, *others = (Image.fromarray(frame) for frame in frames.cpu().numpy())
-    buffer = io.BytesIO()
-    options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
-    first.save(buffer, format="GIF", duration=round(1000 / fps), **options)
-    return buffer.getvalue()
 
 
 class BestCheckpoint(ModelCheckpoint):

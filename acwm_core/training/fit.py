@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers.logger import Logger
 from torch.distributed import DistBackendError
 
 from acwm_core.data.card import DatasetCard
@@ -39,6 +40,7 @@ from acwm_core.training.run import all_training, load_weights
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
 from acwm_core.training.threads import use_threads
+from acwm_core.training.tracking import begin, tracking
 from acwm_core.training.trainer import build_trainer
 
 
@@ -73,7 +75,9 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
         first_step = read_details(checkpoint)["global_step"] if checkpoint else 0
         if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
-            _train(recipe, episodes, run, checkpoint, first_step)
+            loggers = build_loggers(run, recipe.trainer, first_step)
+            with tracking(loggers, run) as continued:
+                _train(recipe, episodes, run, checkpoint, loggers, continued)
         elif resume != AUTO:
             raise TrainingError(
                 f"{run.path} is finished after {first_step} steps; to train on, raise "
@@ -85,7 +89,12 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
 
 
 def _train(
-    recipe: Recipe, episodes: EpisodeDataset, run: RunFolder, checkpoint: Path | None, step: int
+    recipe: Recipe,
+    episodes: EpisodeDataset,
+    run: RunFolder,
+    checkpoint: Path | None,
+    loggers: Sequence[Logger],
+    continued: Sequence[Logger],
 ) -> None:
     config = TrainingConfig(**recipe.training)
     L.seed_everything(config.seed, verbose=False)
@@ -99,7 +108,7 @@ def _train(
         recipe.trainer,
         config,
         [preemption, callbacks.CpuTime(start), *_callbacks(run, config, data)],
-        build_loggers(run, recipe.trainer, step),
+        loggers,
     )
     on_one_cpu = trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1
     before = Recipe.from_yaml(run.recipe).training.get("cpu_threads") if checkpoint else None
@@ -110,7 +119,8 @@ def _train(
         described(run, recipe, episodes.card, checkpoint is None, module),
         preemption.watching(trainer),
     ):
-        for logger in trainer.loggers:
+        for logger in [each for each in trainer.loggers if each not in continued]:
+            begin(logger)  # those of the recipe's own classes
             logger.log_hyperparams(recipe.to_dict())
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import logging
 import os
 import threading
@@ -17,10 +16,10 @@ from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from acwm_core.errors import MissingExtraError
 from acwm_core.files import disk_error, written_whole
 from acwm_core.training.config import LOGGERS, chosen_loggers
 from acwm_core.training.run_folder import RunFolder
+from acwm_core.training.tracking import build_tracker
 
 IRRELEVANT = (
     r".*does not have many workers.*",  # decoding is cheap or cached; data.workers sets the number
@@ -58,7 +57,8 @@ def silence_irrelevant_warnings() -> None:
 def build_loggers(run: RunFolder, flags: Mapping[str, Any], first_step: int) -> list[Logger]:
     """`metrics.csv`, and the loggers that `trainer.logger` names; TensorBoard if it chooses none.
 
-    Loggers keep their files in the run folder and name their run after it.
+    Loggers keep their files in the run folder and name their run after it; a resumed run continues
+    theirs.
 
     Args:
         flags: the section `trainer` of the recipe.
@@ -75,20 +75,8 @@ def build_loggers(run: RunFolder, flags: Mapping[str, Any], first_step: int) -> 
             run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
         )
         loggers.append(board)
-    place, name = run.path.resolve(), run.path.resolve().name
-    project = os.environ.get("WANDB_PROJECT", "acwm")
-    experiment = os.environ.get("MLFLOW_EXPERIMENT_NAME", "acwm")
-    settings: dict[str, dict[str, Any]] = {
-        "wandb": {"save_dir": f"{place}", "name": name, "project": project},
-        "mlflow": {"save_dir": f"{place}/mlruns", "run_name": name, "experiment_name": experiment},
-    }
-    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # MLflow 3 prefers a server
-    for each in [each for each in chosen if isinstance(each, str) and each in settings]:
-        if importlib.util.find_spec(each) is None:
-            install = f"pip install 'acwm[{each}]'"
-            raise MissingExtraError(f"trainer.logger={each} needs {each!r}: {install}")
-        loggers.append(getattr(lightning_loggers, LOGGERS[each])(**settings[each]))
-    return loggers
+    named = [each for each in chosen if isinstance(each, str) and LOGGERS[each]]
+    return [*loggers, *(build_tracker(name, run) for name in named)]
 
 
 class MetricsFile(Logger):

@@ -15,7 +15,7 @@ COPIES = Path("runs", "trained")
 """Folder for results of trained models, whose own folder may be part of a package."""
 
 OWN = (
-    *("recipe.yaml", "card.yaml", "*.safetensors", "metrics.csv", "README.md"),
+    *("recipe.yaml", "card.yaml", "*.safetensors", "metrics.csv", "README.md", "loggers.json"),
     *(
         f"{folder}{rest}"
         for folder in ("checkpoints", "samples", "evaluation", "planning")
@@ -37,6 +37,7 @@ class RunFolder:
         weights: the averaged weights of model and conditioner, for prediction.
         metrics: logged metrics by step, as CSV.
         samples: sample videos made during training.
+        loggers: the ids of this run at services such as Weights & Biases.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -48,6 +49,7 @@ class RunFolder:
         self.weights = path / "model.safetensors"
         self.metrics = path / "metrics.csv"
         self.samples = path / "samples"
+        self.loggers = path / "loggers.json"
 
     def check_links(self) -> None:
         """Refuse links that lead out of the folder among acwm's own files."""

@@ -1,17 +1,26 @@
 """The file of metrics, and loggers: the real packages, offline."""
 
 import csv
+import json
 import shutil
+import struct
+import sys
+from dataclasses import dataclass
 
 import pytest
+import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.backend.event_processing import event_accumulator
 
 from acwm_core import executors
-from acwm_core.errors import MissingExtraError
+from acwm_core.errors import MissingExtraError, TrainingError
+from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
 from acwm_core.training.loggers import MetricsFile, build_loggers
 from acwm_core.training.run_folder import RunFolder
+from acwm_zoo.packing import pack
+from tests import tiny
 from tests.tiny import tiny_recipe
 from tests.training.runs import killable
 
@@ -48,34 +57,167 @@ def test_a_class_of_lightnings_takes_its_own_arguments(data, tmp_path):
     assert Recipe.from_yaml(run.recipe).trainer["logger"] == logger
 
 
-def test_mlflow_has_the_losses_and_the_recipe(data, tmp_path):
-    run = train(data, tmp_path / "run", "mlflow")
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory, tiny_parts):
+    return tiny.make_dataset(
+        tmp_path_factory.mktemp("data") / "drift", train=6, ind_test=2, ood_test=2
+    )
+
+
+@pytest.fixture
+def offline(monkeypatch):
+    if wandb := sys.modules.get("wandb"):
+        wandb.teardown()  # it remembers the variables of before
+    for name, value in {"WANDB_MODE": "offline", "WANDB_SILENT": "true"}.items():
+        monkeypatch.setenv(name, value)
+    yield
+    if wandb := sys.modules.get("wandb"):
+        wandb.finish()
+
+
+@dataclass
+class Logged:
+    """What a service has been told in one run of its own."""
+
+    name: str
+    losses: dict[int, float]
+    model: str
+    pictures: list[str]
+    finished: bool
+
+
+def tensorboard(run):
+    size = {kind: 0 for kind in (event_accumulator.IMAGES, event_accumulator.SCALARS)}
+    found = event_accumulator.EventAccumulator(str(run.path / "tensorboard"), size).Reload()
+    losses = {each.step: each.value for each in found.Scalars("train/loss")}
+    recipe = yaml.safe_load((run.path / "tensorboard/hparams.yaml").read_text())
+    return [Logged("run", losses, recipe["model"]["name"], found.Tags()["images"], True)]
+
+
+def mlflow(run):
     from mlflow.tracking import MlflowClient
 
     client = MlflowClient(f"file:{run.path}/mlruns")
-    experiment = client.get_experiment_by_name("acwm")
-    (found,) = client.search_runs([experiment.experiment_id])
-    assert (found.info.run_name, found.info.status) == ("run", "FINISHED")
-    history = client.get_metric_history(found.info.run_id, "train/loss")
-    assert [each.value for each in history] == losses(run)
-    assert found.data.params["model/name"] == "tiny_model"
+    found = client.search_runs([client.get_experiment_by_name("acwm").experiment_id])
+    return [
+        Logged(
+            each.info.run_name,
+            {m.step: m.value for m in client.get_metric_history(each.info.run_id, "train/loss")},
+            each.data.params["model/name"],
+            [file.path for file in client.list_artifacts(each.info.run_id)],
+            each.info.status == "FINISHED",
+        )
+        for each in found
+    ]
 
 
-def test_wandb_has_the_losses_and_the_recipe(data, tmp_path, monkeypatch):
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    import wandb
+def wandb(run):
+    """The runs in the files that `wandb sync` would send, by their ids."""
+    from wandb.proto.wandb_internal_pb2 import Record
 
-    try:
-        run = train(data, tmp_path / "run", "wandb")
-        logged = wandb.run
-        assert logged is not None
-        assert (logged.name, logged.project) == ("run", "acwm")
-        assert logged.summary["train/loss"] == pytest.approx(losses(run)[-1])
-        assert logged.config["model"]["name"] == "tiny_model"
-    finally:
-        wandb.finish()
-    assert [*(run.path / "wandb").glob("offline-run-*/run-*.wandb")]
+    runs = {}
+    for path in sorted((run.path / "wandb").glob("offline-run-*/run-*.wandb")):
+        logged = runs.setdefault(path.stem, Logged("", {}, "", [], False))
+        for data in leveldb_records(path.read_bytes()):
+            record = Record.FromString(data)
+            if record.run.display_name:
+                logged.name = record.run.display_name
+            for item in record.run.config.update or record.config.update:
+                if item.key == "model":
+                    logged.model = json.loads(item.value_json)["name"]
+            row = {(i.key or i.nested_key[0]): i.value_json for i in record.history.item}
+            if "train/loss" in row:
+                logged.losses[int(row["trainer/global_step"])] = float(row["train/loss"])
+            items = [[*item.nested_key] for item in record.history.item]
+            logged.pictures += [keys[0] for keys in items if keys[-1:] == ["_type"]]
+            logged.finished = record.WhichOneof("record_type") == "exit" or logged.finished
+    return list(runs.values())
+
+
+def leveldb_records(data):
+    """The records of a log of LevelDB: blocks of 32 KiB with parts of (CRC-32, length, kind)."""
+    place, record = 7, b""  # after a header of W&B's own
+    while place < len(data):
+        if 32768 - place % 32768 < 7:
+            place += 32768 - place % 32768
+            continue
+        length, kind = struct.unpack_from("<HB", data, place + 4)
+        record += data[place + 7 : place + 7 + length]
+        place += 7 + length
+        if kind in (1, 4):  # whole, or the last part
+            yield record
+            record = b""
+
+
+SERVICES = {"tensorboard": tensorboard, "mlflow": mlflow, "wandb": wandb}
+
+
+@pytest.mark.parametrize("name", [*SERVICES, "csv"])
+def test_a_run_is_trained_continued_judged_and_shipped_with_each(
+    name, drifting, tmp_path, offline, monkeypatch
+):
+    """A service sees one run, with every step, its pictures and the recipe."""
+    if name in ("wandb", "mlflow"):
+        pytest.importorskip(name)
+    quick = {**tiny.METRICS, "metrics": ["mse"], "counterfactual_metrics": [], "videos": 0}
+    quick |= {"device": "cpu", "steps_sweep": [], "perturbed_episodes": 0}
+    recipe = {
+        "env": {"name": "drift"},
+        "codec": {"name": "blocks"},
+        "model": {"name": "linear"},
+        "conditioner": {"name": "linear"},
+        "objective": {"steps": 2, "prediction": "clean"},
+        "data": {
+            "path": str(drifting),
+            "clip_frames": 9,
+            "batch_size": 2,
+            "validation_episodes": 2,
+        },
+        "training": {"validate_every_n_steps": 2, "sample_every_n_steps": 2, "cpu_threads": 1},
+        "trainer": {"max_steps": 2, "accelerator": "cpu", "log_every_n_steps": 1, "logger": name},
+        "evaluation": quick,
+    }
+    run = RunFolder(fit(Recipe.from_dict(recipe), tmp_path / "run"))
+    recipe["trainer"]["max_steps"] = 4
+    fit(Recipe.from_dict(recipe), "", resume=run.path)  # as after a requeue, by another process
+    evaluate_run(run.path, progress=False)
+    assert RunFolder(pack(run.path, tmp_path / "model")).weights.is_file()
+    assert len(losses(run)) == 4
+    assert len([*run.samples.iterdir()]) == 2
+    if name == "csv":
+        return
+    (found,) = SERVICES[name](run)
+    assert found.name == "run"
+    assert [found.losses[step] for step in range(4)] == pytest.approx(losses(run), rel=1e-6)
+    assert "linear" in found.model
+    assert {each.split(":")[0].split("/")[0] for each in found.pictures} >= PICTURES[name]
+    assert found.finished
+
+
+PICTURES = {
+    "tensorboard": {"samples", "validation"},
+    "mlflow": {"samples", "images"},
+    "wandb": {"samples", "validation"},
+}
+
+
+def test_wandb_without_a_login_is_told_before_any_work(data, tmp_path, monkeypatch):
+    pytest.importorskip("wandb").teardown()
+    for name in ("WANDB_MODE", "WANDB_API_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NETRC", str(tmp_path / "none"))
+    monkeypatch.setattr("acwm_core.training.fit.build_world_model", None)  # not asked
+    with pytest.raises(TrainingError, match=r"wandb login.*WANDB_MODE=offline"):
+        train(data, tmp_path / "run", "wandb")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_of_wandb_that_was_open_before_stays_open(data, tmp_path, offline):
+    """As in an agent of a sweep, which began it."""
+    wandb = pytest.importorskip("wandb")
+    own = wandb.init(project="mine", dir=str(tmp_path))
+    train(data, tmp_path / "run", "wandb")
+    assert wandb.run is own
 
 
 def test_one_that_is_not_installed_names_its_extra(tmp_path, monkeypatch):
