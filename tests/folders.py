@@ -4,6 +4,9 @@ import hashlib
 import time
 from pathlib import Path
 
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.shards import open_shard
+
 
 def checksums(folder):
     """SHA-256 of every file of a data folder but its lock."""
@@ -24,3 +27,13 @@ def wait_until(condition, process=None, seconds=600):
         assert not ended, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.005)
+
+
+def damage_episode(data, split, index, member="video.mkv"):
+    """Change a byte of one member of an episode; its shard's other episodes stay sound."""
+    episodes = EpisodeDataset(data, split)
+    number = episodes.shard_of(index)
+    path, place = episodes.shard_path(number), index - episodes.shards[number][0]
+    content = bytearray(path.read_bytes())
+    content[open_shard(path).episodes[place][member].offset + 20] ^= 255
+    path.write_bytes(content)

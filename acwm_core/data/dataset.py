@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.card import MANIFEST, DatasetCard
 from acwm_core.data.remote import data_folder, fetch_shard, origin
-from acwm_core.data.shards import ShardReader, ShardRecord, open_shard
+from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, open_shard
 from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError
@@ -178,6 +178,16 @@ class EpisodeDataset:
         """The raw actions of an episode, ``[T, A]``."""
         reader, position = self._locate(index)
         return reader.array(position, "actions.npy")
+
+    def damage(self, index: int) -> str | None:
+        """Why an episode cannot be read, if it cannot; all its bytes are checked."""
+        try:
+            reader, position = self._locate(index)
+            for name in MEMBERS:
+                reader.read(position, name)
+        except DataError as error:
+            return str(error)
+        return None
 
     def about(self, index: int) -> dict[str, Any]:
         """Spec, factors, ood_label and versions of an episode, without decoding its video."""

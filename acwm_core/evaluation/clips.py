@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.clips import window_actions
 from acwm_core.env.episode import SPLITS, Episode
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.protocol import protocol_named
 
@@ -72,17 +73,47 @@ class Clip:
         return f"in episode {self.episode} of {self.split}, from frame {self.start}"
 
 
+def sound_clips(
+    episodes: EpisodeDataset, config: EvaluationConfig, given: int
+) -> tuple[list[Clip], dict[str, str]]:
+    """The clips of the episodes that can be read, and why others cannot, by their names.
+
+    Raises:
+        DataError: fewer than two can be read, or as `plan_clips`.
+    """
+    split = episodes.split
+    chosen = protocol_named(config.protocol).episodes(len(episodes), config)
+    damage = {each: why for each in chosen if (why := episodes.damage(each))}
+    if damage:
+        first, why = next(iter(damage.items()))
+        told = f"{len(damage)} of {len(chosen)} episodes of {split} cannot be read"
+        if len(chosen) - len(damage) < 2:
+            raise DataError(f"{told}, and evaluation needs two; {why}")
+        warnings.warn(
+            f"{told} and are left out, e.g. episode {first}: {why}", AcwmWarning, stacklevel=2
+        )
+    clips = plan_clips(split, episodes.lengths, config, given, without=damage)
+    return clips, {f"episode {each} of {split}": why for each, why in damage.items()}
+
+
 def plan_clips(
-    split: str, lengths: Sequence[int], config: EvaluationConfig, given: int = 1
+    split: str,
+    lengths: Sequence[int],
+    config: EvaluationConfig,
+    given: int = 1,
+    without: Collection[int] = (),
 ) -> list[Clip]:
     """The clips of a split with episodes of these lengths, in order, with `given` context frames.
+
+    Args:
+        without: numbers of episodes that are left out.
 
     Raises:
         DataError: fewer than two episodes, so that there are no other episode's actions to use; or
             a clip that is not longer than its context frames.
     """
     protocol = protocol_named(config.protocol)
-    chosen = protocol.episodes(len(lengths), config)
+    chosen = [each for each in protocol.episodes(len(lengths), config) if each not in without]
     if len(chosen) < 2:
         raise DataError(
             f"{split} has {len(chosen)} episode(s), but evaluation needs two, to predict one with "

@@ -21,7 +21,7 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmWarning, DataError, RecipeError
-from acwm_core.evaluation.clips import PREDICTORS, Predictor, plan_clips
+from acwm_core.evaluation.clips import PREDICTORS, Predictor, sound_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
 from acwm_core.evaluation.predict import Evaluator, VideoModel
@@ -156,10 +156,8 @@ def _evaluate(
     progress: bool,
 ) -> Summary:
     started, config = time.monotonic(), evaluator.config
-    clips = {
-        split: plan_clips(split, each.lengths, config, evaluator.given)
-        for split, each in datasets.items()
-    }
+    planned = {s: sound_clips(each, config, evaluator.given) for s, each in datasets.items()}
+    clips = {split: each for split, (each, _) in planned.items()}
     total = sum(evaluator.count_rows(each) for each in clips.values())
     with progress_bar(evaluator, total + units_of_work(evaluator, clips), progress) as shown:
         scores = {s: scores_with_references(shown, clips[s], datasets[s]) for s in datasets}
@@ -170,6 +168,8 @@ def _evaluate(
     scores = {split: [*each, *found.scores.get(split, ())] for split, each in scores.items()}
     summary = _summarise(home, entrant, evaluator, scores, sweeps, found)
     summary.videos.extend(record for record, _ in videos)
+    for _, damaged in planned.values():
+        summary.left_out.update(damaged)
     summary.provenance.update(provenance(evaluator, datasets, entrant.facts))
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(home, summary, scores, videos)

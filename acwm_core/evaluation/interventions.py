@@ -35,7 +35,7 @@ COUNTERFACTUAL, PERTURBED = "counterfactual", "perturbed"
 """Names of the two tests in `Summary.left_out`."""
 
 TRIED_FRAMES = 8
-"""How many frames of the first episode the simulator must reproduce."""
+"""How many frames of an episode the simulator must reproduce."""
 
 UNPREDICTABLE = 0.5
 """From this share on a frame counts as unpredictable: its squared error relative to that of
@@ -59,8 +59,11 @@ class Interventions:
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
 
-def simulator_of(episodes: EpisodeDataset) -> Environment:
+def simulator_of(episodes: EpisodeDataset, tried: int = 0) -> Environment:
     """The environment that simulated these episodes.
+
+    Args:
+        tried: number of the episode that it must reproduce.
 
     Raises:
         DataError: there is none: the data was recorded, or the simulator is not installed or has
@@ -73,7 +76,7 @@ def simulator_of(episodes: EpisodeDataset) -> Environment:
         environment = make_environment(card.environment.name, card.options)
     except AcwmError as error:
         raise DataError(f"its simulator is not available ({error})") from error
-    first = episodes[0]
+    first = episodes[tried]
     frames = min(TRIED_FRAMES, len(first.video))
     again = simulate(environment, first.spec, first.actions[:frames], frames=frames)
     if np.abs(again.video - first.video[:frames].astype(float)).mean() > 1:  # beyond rounding
@@ -121,7 +124,8 @@ def intervene(
     if not asked:
         return found
     try:
-        environment = simulator_of(next(iter(datasets.values())))
+        split, first = next((split, each[0]) for split, each in clips.items())
+        environment = simulator_of(datasets[split], first.episode)
     except DataError as error:
         found.left_out.update(dict.fromkeys(sorted(asked), str(error)))
         return found

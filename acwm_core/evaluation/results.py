@@ -260,7 +260,8 @@ class Summary:
         videos: the videos in the folder ``videos``.
         provenance: versions, hashes, dataset, settings and times.
         protocol: which clips were predicted, see `acwm_core.evaluation.protocol.Protocol`.
-        left_out: metrics of the recipe and tests that could not be measured, and why.
+        left_out: metrics of the recipe and tests that could not be measured, and episodes that
+            could not be read, and why.
         published: published scores of the same setting or environment; None if there are none.
     """
 

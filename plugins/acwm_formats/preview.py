@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.video import write_mp4
 from acwm_core.env.episode import Split
+from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.files import writable, written_whole
 
 Picture = NDArray[np.uint8]
@@ -71,7 +73,8 @@ def preview(
         and shifted factor of each episode.
 
     Raises:
-        DataError: there is no dataset, it is unfinished or damaged, or `out` cannot be written.
+        DataError: there is no dataset, it is unfinished, none of the episodes can be read, or `out`
+            cannot be written.
     """
     out = writable(Path(out), folder=True)
     card = DatasetCard.read(path)
@@ -80,9 +83,15 @@ def preview(
     for split in card.splits:
         dataset = EpisodeDataset(path, split)
         for index in range(min(episodes, len(dataset))):
+            if why := dataset.damage(index):
+                left = f"episode {index} of {split} is left out: {why}"
+                warnings.warn(left, AcwmWarning, stacklevel=2)
+                continue
             shifted = cast(str | None, dataset.about(index)["ood_label"])
             labels.append(Label(f"{split} {index}", shifted or ""))
             videos.append(dataset.video(index).transpose(0, 2, 3, 1))
+    if not videos:
+        raise DataError(f"none of the first episodes of {path} can be read: run `acwm data check`")
     out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "preview.png", out / "preview.mp4"
     with written_whole(sheet) as partial:
@@ -104,9 +113,16 @@ def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, An
     whole = facts["made"] == facts["episodes"]
     if not card.source and split == "ood_test" and whole:  # recorded shifts are not labelled
         dataset = EpisodeDataset(path, split)
-        labels = (cast(str | None, dataset.about(i)["ood_label"]) for i in range(len(dataset)))
-        facts["ood_labels"] = dict(sorted(Counter(label or "none" for label in labels).items()))
+        labels = Counter(_label(dataset, index) for index in range(len(dataset)))
+        facts["ood_labels"] = dict(sorted(labels.items()))
     return facts
+
+
+def _label(dataset: EpisodeDataset, index: int) -> str:
+    try:
+        return dataset.about(index)["ood_label"] or "none"
+    except DataError:
+        return "nothing that can be read"
 
 
 class Label(NamedTuple):

@@ -47,7 +47,8 @@ class PlanningJob:
         """The share of its episodes that are in its folder, in [0, 1].
 
         Episodes of other weights or settings do not count. Rows that the task does not have, such
-        as a scripted solution, are not missing, nor are seeds that are solved at their start.
+        as a scripted solution, are not missing, nor are seeds that are solved at their start and
+        episodes in which something failed.
         """
         try:
             summary: Mapping[str, Any] = parse_json((self.folder / PLAN_SUMMARY).read_bytes())
@@ -59,7 +60,8 @@ class PlanningJob:
             present = {(row["row"], seed) for row in summary["rows"] for seed in row["seeds"]}
             rows = {*self.rows} - {*summary.get("left_out", ())}
             seeds = {*self.seeds} - {*summary.get("solved_at_start", ())}
-            required = {*itertools.product(rows, seeds)}
+            failed = {(row, seed) for row, seed, _ in summary.get("failed", ())}
+            required = {*itertools.product(rows, seeds)} - failed
             return 1.0 if required <= present else len(required & present) / len(required)
         except (OSError, ValueError, LookupError, TypeError, AttributeError, DataError):
             return 0.0

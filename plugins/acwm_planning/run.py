@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,8 +11,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
-from acwm_core.errors import AcwmWarning
+from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.plugins import catalog
@@ -21,7 +19,6 @@ from acwm_core.training.run import RunBundle, load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.controllers import (
     Controller,
-    NoSolutionError,
     PlanningController,
     RandomController,
     ScriptedController,
@@ -29,6 +26,7 @@ from acwm_planning.controllers import (
 )
 from acwm_planning.episode import EpisodeResult, TaskVariant, play, spec_of_seed
 from acwm_planning.futures import ModelRollouts
+from acwm_planning.left_out import LeftOut
 from acwm_planning.page import write_page
 from acwm_planning.planner import Cost, Planner
 from acwm_planning.resumable import Line, ResumableResults
@@ -187,32 +185,23 @@ def plan_episodes(
         "file_sha256": file_sha256(weights),
     }
     results = ResumableResults(out, {**identity, **settings.to_dict()})
-    unsolved: set[str] = set()
-    solved: dict[int, SolvedAtStartError] = {}
+    left = LeftOut()
     try:
         with results.adding():
             for row, seed in missing_episodes(rows, seeds, results.finished()):
-                if row in unsolved or seed in solved:
+                if row in left.rows or seed in left.solved:
                     continue
-                try:
+                with left.trying(row, seed):
                     result, controller = player.play(row, seed)
-                except NoSolutionError:
-                    unsolved.add(row)
-                    continue
-                except SolvedAtStartError as error:
-                    warnings.warn(f"{error}: it is left out", AcwmWarning, stacklevel=2)
-                    solved[seed] = error
-                    continue
-                if seed in seeds[:videos]:
-                    player.write_video(out / VIDEOS, row, seed, result, controller)
-                line = {"row": row, "seed": seed, **result.facts()}
-                results.add(line)
-                _write_table(results, facts)
-                report(line)
-            if len(solved) == len({*seeds}):
-                raise solved[seeds[0]]
-            left = {"left_out": sorted(unsolved), "solved_at_start": sorted(solved)}
-            return _write_table(results, {**facts, **left})
+                    if seed in seeds[:videos]:
+                        player.write_video(out / VIDEOS, row, seed, result, controller)
+                    line = {"row": row, "seed": seed, **result.facts()}
+                    results.add(line)
+                    _write_table(results, {**facts, **left.facts()})
+                    report(line)
+            if left.error and not results.finished():
+                raise left.error
+            return _write_table(results, {**facts, **left.facts()})
     finally:
         player.close()
 

@@ -65,7 +65,7 @@ def write_data_report(found: Survey, out: str | Path) -> Path:
 
 
 def _samples(found: Survey) -> list[Sample]:
-    places = all_places(found.lengths)
+    places = [each for each in all_places(found.lengths) if each not in found.unread.places]
     samples: list[Sample] = []
     for place in spread(len(places), SHOWN):
         split, index = places[place]

@@ -8,11 +8,13 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.env.environment import ActionSpec
+from acwm_core.errors import DataError
 from acwm_formats.arrays import Recording, write_dataset
 from acwm_formats.survey.following import _delay
 from acwm_formats.survey.survey import SURE, short_form, survey
 from acwm_report import data_page
 from acwm_report.data_page import write_data_report
+from tests.folders import damage_episode
 
 ACTION = ActionSpec(("down", "right"), ("px", "px"), (-4, -4), (4, 4), "delta")
 
@@ -187,3 +189,21 @@ def test_measured_needs_become_a_table(tmp_path, monkeypatch):
         ["30.12", "0.50", "31.00"],
     ]
     assert [row.title for row in table.rows] == ["32", "2,048"]
+
+
+def test_episodes_that_cannot_be_read_do_not_end_the_report(tmp_path):
+    data = written(tmp_path / "data", [blob(n) for n in range(4)], [blob(5), blob(6)])
+    damage_episode(data, "train", 1)
+    damage_episode(data, "ind_test", 0, "actions.npy")
+    found = survey(data)
+    assert [*found.unread.places] == [("train", 1), ("ind_test", 0)]
+    assert "2 of 6 episodes looked at cannot be read, e.g. train 1" in texts(found, "bad")
+    assert write_data_report(found, tmp_path / "page.html").read_text().count("<video") == 4
+    drawn = CliRunner().invoke(main, ["data", "preview", str(data)])
+    assert drawn.exit_code == 0
+    for index, split in enumerate(["train"] * 4 + ["ind_test"] * 2):
+        place = index % 4
+        if (split, place) != ("ind_test", 0):  # a second change would mend it
+            damage_episode(data, split, place, "actions.npy")
+    with pytest.raises(DataError, match="none of the 6 episodes looked at can be read"):
+        survey(data)

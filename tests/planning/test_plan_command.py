@@ -152,6 +152,27 @@ def test_episodes_that_are_solved_at_their_start_are_left_out(mine, capsys, monk
     assert (code, "solved at the start" in err) == (2, True)
 
 
+def test_an_episode_that_fails_does_not_end_the_others(mine, capsys, monkeypatch):
+    draw = tiny.PLACE.sample_goal
+
+    def sample_goal(environment, rng):
+        if environment.episode_spec.index == 1:
+            raise ZeroDivisionError("no place")
+        return draw(environment, rng)
+
+    monkeypatch.setattr(tiny.PLACE, "sample_goal", sample_goal, raising=False)
+    words = ["plan", mine, "place", "--row", "still", "--videos", "0"]
+    code, _, err = acwm(capsys, *words, "--seeds", "0..2")
+    assert code == 0, err
+    assert "still with seed 1 is left out: ZeroDivisionError: no place" in err
+    folder = mine / "planning" / "place"
+    assert [each["seed"] for each in lines(folder)] == [0, 2]
+    ((row, seed, _),) = json.loads((folder / "summary.json").read_text())["failed"]
+    assert (row, seed) == ("still", 1)
+    code, _, err = acwm(capsys, *words, "--seeds", "1", "--out", mine / "none")
+    assert (code, "no place" in err, "Traceback" in err) == (2, True, False)
+
+
 def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):
     recurrent = {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1}
     parts = {"model": recurrent, "conditioner": {"name": "adaln", "embedding": "stacked"}}

@@ -50,6 +50,28 @@ def test_a_ranking_is_made_and_gone_on_with(mine, capsys, tmp_path, monkeypatch)
     assert (code, "holds results of another steps" in err) == (2, True)
 
 
+def test_a_policy_that_fails_does_not_end_the_others(mine, capsys, tmp_path, monkeypatch):
+    """Where one fails once, all are compared on the other episodes; one that always fails goes."""
+    (tmp_path / "fallible.py").write_text(
+        "calls = []\n"
+        "def once(frame):\n"
+        "    calls.append(frame)\n"
+        "    if len(calls) == 1:\n"
+        "        raise KeyError('first')\n"
+        "    return [1.0, 1.0]\n"
+        "def never(frame):\n"
+        "    return [1.0]\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    policies = ["behaviour", "fallible:once", "fallible:never"]
+    words = ["rank", mine, "place", *(w for p in policies for w in ("--policies", p))]
+    code, out, err = acwm(capsys, *words, "--seeds", "0..2")
+    assert code == 0, err
+    assert "2 policies, 2 episodes of each" in out
+    assert "fallible:once with seed 0 is left out: KeyError: 'first'" in err
+    assert err.count("fallible:never with seed") == 3
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

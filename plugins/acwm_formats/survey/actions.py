@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
 from acwm_core.env.episode import Split
-from acwm_formats.survey.sample import all_places, spread
+from acwm_core.errors import DataError
+from acwm_formats.survey.sample import Unread, all_places, spread
 
 EPISODES = 4000  # most episodes whose actions are read
 ROWS = 400_000  # most rows of actions that are kept
@@ -54,12 +55,25 @@ class ActionSummary:
     counts: tuple[int, ...]
 
 
-def action_facts(data: Mapping[Split, EpisodeDataset], spec: ActionSpec) -> list[ActionSummary]:
-    """Describe each action; of more than `EPISODES` episodes, as many spread evenly."""
+def action_facts(
+    data: Mapping[Split, EpisodeDataset], spec: ActionSpec, unread: Unread
+) -> list[ActionSummary]:
+    """Describe each action; of more than `EPISODES` episodes, as many spread evenly.
+
+    Raises:
+        DataError: none can be read.
+    """
     places = all_places({split: each.lengths for split, each in data.items()})
     chosen = [places[place] for place in spread(len(places), EPISODES)]
     room = max(1, ROWS // len(chosen))
-    rows = [_some(data[split].actions(index)[:-1], room) for split, index in chosen]
+    rows = [
+        _some(actions[:-1], room)
+        for split, index in chosen
+        for actions in unread.read(split, index, lambda s=split, i=index: data[s].actions(i))
+    ]
+    if not rows:
+        why = next(iter(unread.places.values()))
+        raise DataError(f"none of the {len(chosen)} episodes looked at can be read; {why}")
     every = np.concatenate(rows).astype(np.float64)
     return [_facts(spec, place, every[:, place]) for place in range(every.shape[1])]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
 from acwm_formats.survey.motion import small
-from acwm_formats.survey.sample import spread
+from acwm_formats.survey.sample import Unread, spread
 
 EPISODES = 2000  # most episodes of a split that are compared
 NEAR = 3 / 255  # largest difference of two small frames that are the same
@@ -35,20 +35,30 @@ class _Print:
     actions: NDArray[np.float32]
 
 
-def near_duplicates(data: Mapping[Split, EpisodeDataset]) -> tuple[list[NearDuplicate], int]:
+def near_duplicates(
+    data: Mapping[Split, EpisodeDataset], unread: Unread
+) -> tuple[list[NearDuplicate], int]:
     """Find test episodes that equal training episodes; also returns how many were compared."""
     if "train" not in data or len(data) == 1:
         return [], 0
-    known = {i: _print(data["train"], i) for i in spread(len(data["train"]), EPISODES)}
+
+    def prints(split: Split) -> Iterator[tuple[int, _Print]]:
+        for index in spread(len(data[split]), EPISODES):
+            made = unread.read(split, index, lambda i=index: _print(data[split], i))
+            yield from ((index, each) for each in made)
+
+    known = dict(prints("train"))
+    if not known:
+        return [], 0
     frames = np.stack([each.frames for each in known.values()])
     actions = np.stack([each.actions for each in known.values()])
     scale = actions.reshape(-1, actions.shape[-1]).std(0) + 1e-9
     found: list[NearDuplicate] = []
     count = 0
-    for split, dataset in data.items():
-        for index in spread(len(dataset), EPISODES) if split != "train" else ():
+    tests: list[Split] = [each for each in data if each != "train"]
+    for split in tests:
+        for index, seen in prints(split):
             count += 1
-            seen = _print(dataset, index)
             apart = np.abs(actions - seen.actions).max(1) / scale
             for place in np.flatnonzero((apart <= ALIKE).all(-1)):
                 gap = np.abs(frames[place].astype(np.int16) - seen.frames).max()

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.episode import Split
+from acwm_core.errors import DataError
+
+T = TypeVar("T")
 
 LENGTH = 64  # frames of a stretch, at most
 MOST, LEAST = 128, 24  # stretches
@@ -37,6 +41,28 @@ class Stretch:
     actions: NDArray[np.float32]
 
 
+@dataclass
+class Unread:
+    """Episodes that cannot be read: they are left out, and told.
+
+    Attributes:
+        places: split and index of each, and why.
+        tried: split and index of all that were tried.
+    """
+
+    places: dict[tuple[Split, int], str] = field(default_factory=dict[tuple[Split, int], str])
+    tried: set[tuple[Split, int]] = field(default_factory=set[tuple[Split, int]])
+
+    def read(self, split: Split, index: int, how: Callable[[], T]) -> list[T]:
+        """What `how` reads of an episode; nothing if it cannot be read."""
+        self.tried.add((split, index))
+        try:
+            return [how()]
+        except DataError as error:
+            self.places.setdefault((split, index), str(error))
+            return []
+
+
 def spread(count: int, most: int) -> list[int]:
     """At most `most` of the indices 0 … `count` − 1, evenly spread."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
@@ -47,7 +73,7 @@ def all_places(lengths: Mapping[Split, list[int]]) -> list[tuple[Split, int]]:
     return [(split, index) for split, each in lengths.items() for index in range(len(each))]
 
 
-def stretches(data: Mapping[Split, EpisodeDataset]) -> Iterator[Stretch]:
+def stretches(data: Mapping[Split, EpisodeDataset], unread: Unread) -> Iterator[Stretch]:
     """Read stretches one by one, so that one is in memory at a time."""
     places = all_places({split: each.lengths for split, each in data.items()})
     height, width = next(iter(data.values())).card.environment.frame_size
@@ -58,9 +84,16 @@ def stretches(data: Mapping[Split, EpisodeDataset]) -> Iterator[Stretch]:
         length = data[split].lengths[index]
         for start in _starts(length, most // len(chosen), order):
             stop = min(length, start + LENGTH)
-            video = data[split].video(index, start, stop)
-            actions = data[split].actions(index)[start : stop - 1]
-            yield Stretch(split, index, start, video, actions)
+            window = split, index, start, stop
+            yield from unread.read(split, index, lambda w=window: _stretch(data, *w))
+
+
+def _stretch(
+    data: Mapping[Split, EpisodeDataset], split: Split, index: int, start: int, stop: int
+) -> Stretch:
+    video = data[split].video(index, start, stop)
+    actions = data[split].actions(index)[start : stop - 1]
+    return Stretch(split, index, start, video, actions)
 
 
 def _starts(length: int, wanted: int, order: int) -> list[int]:

@@ -16,7 +16,7 @@ from acwm_formats.survey.following import SHIFTS, Following, Moments, following
 from acwm_formats.survey.frames import FrameFacts
 from acwm_formats.survey.motion import small
 from acwm_formats.survey.near_duplicates import NearDuplicate, near_duplicates
-from acwm_formats.survey.sample import stretches
+from acwm_formats.survey.sample import Unread, stretches
 
 SURE = 0.9  # confidence from which a delay is stated and a shift is advised
 
@@ -56,6 +56,7 @@ class Survey:
         following: whether the video follows the actions; None if that cannot be told.
         near_duplicates: test episodes that nearly equal training episodes.
         compared: number of test episodes that were compared.
+        unread: episodes that cannot be read, of those that were looked at.
         findings: what to know first; the worst come first.
     """
 
@@ -67,11 +68,13 @@ class Survey:
     following: Following | None
     near_duplicates: list[NearDuplicate]
     compared: int
+    unread: Unread
 
     @property
     def findings(self) -> list[Finding]:
         """All sentences, the bad ones first."""
         every = [
+            *_of_unread(self.unread),
             *_of_following(self),
             *_of_actions(self),
             *_of_frames(self),
@@ -104,28 +107,29 @@ def survey(path: str | Path) -> Survey:
     episodes.
 
     Raises:
-        DataError: there is no dataset, or it is unfinished or damaged.
+        DataError: there is no dataset, or it is unfinished, or none of its episodes can be read.
     """
     path = data_folder(path)
     card = DatasetCard.read(path)
     data: dict[Split, EpisodeDataset] = {
         split: EpisodeDataset(path, split) for split in card.splits
     }
-    frames, moments = FrameFacts(), list[Moments]()
-    for each in stretches(data):
+    frames, moments, unread = FrameFacts(), list[Moments](), Unread()
+    for each in stretches(data, unread):
         place = each.split, each.episode
         frames.add((*place, each.start), each.video, each.actions, card.environment.views)
         moments.append(Moments(place, each.start, small(each.video), each.actions))
-    found, compared = near_duplicates(data)
+    found, compared = near_duplicates(data, unread)
     return Survey(
         path=path,
         card=card,
         lengths={split: each.lengths for split, each in data.items()},
-        actions=action_facts(data, card.environment.action),
+        actions=action_facts(data, card.environment.action, unread),
         frames=frames,
         following=following(moments),
         near_duplicates=found,
         compared=compared,
+        unread=unread,
     )
 
 
@@ -142,6 +146,13 @@ def _frames(count: int) -> str:
 
 def _sure(confidence: float) -> str:
     return "over 99 %" if confidence > 0.99 else f"{confidence:.0%}"
+
+
+def _of_unread(unread: Unread) -> Iterator[Finding]:
+    if unread.places:
+        (split, index), why = next(iter(unread.places.items()))
+        count = f"{len(unread.places)} of {len(unread.tried)} episodes looked at"
+        yield Finding("bad", f"{count} cannot be read, e.g. {split} {index}: {why}")
 
 
 def _of_following(found: Survey) -> Iterator[Finding]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Frame, Goal
-from acwm_core.errors import RecipeError, noting
+from acwm_core.errors import PluginError, RecipeError, noting
 from acwm_core.recipe.trust import import_named
 
 
@@ -64,7 +64,7 @@ class OwnPolicy:
             state: states that an estimator read from it, if the policy observes them.
 
         Raises:
-            RecipeError, PluginError: the policy fails, or does not return an action.
+            PluginError: the policy does not return an action.
         """
         if isinstance(self._policy, torch.nn.Module) and self.observes == "frame":
             picture = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None] / 255
@@ -78,7 +78,7 @@ class OwnPolicy:
         spec = self._card.action
         action = np.asarray(answer)
         if action.shape != (spec.size,) or not is_finite(action):
-            raise RecipeError(
+            raise PluginError(
                 f"the policy {self.name} returned an array of shape {np.shape(answer)}, but "
                 f"{self._card.name} needs {spec.size} finite numbers"
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,8 @@ from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
-from acwm_core.env.task import Goal, SolvedAtStartError, Task, TaskEnvironment
-from acwm_core.errors import AcwmWarning, DataError, RecipeError
+from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
+from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
@@ -27,6 +26,7 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.episode import spec_of_seed
+from acwm_planning.left_out import LeftOut
 from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, read_outcome
 from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
@@ -42,6 +42,9 @@ from acwm_planning.resumable import Line, ResumableResults
 
 SCRIPTED = "scripted"
 """Stands for all built-in scripted policies."""
+
+TRIED_SEEDS = 20
+"""How many next seeds may give the other actions of a decision, if some are solved at the start."""
 
 BRANCHES = ("another", "still", "reversed", "mirrored")
 """Alternatives to a start's own actions in a decision; see `plan_branches`."""
@@ -75,22 +78,28 @@ class Ranker:
         """Names of everything that is rolled out from a start: the policies, and the decision."""
         return [*(policy.name for policy in self.policies), DECISION]
 
-    def lines(self, seed: int, names: Sequence[str]) -> list[Line]:
-        """Results for some of `names`, from the start of a seed."""
+    def lines(self, seed: int, names: Sequence[str], left: LeftOut) -> list[Line]:
+        """Results for some of `names`, from the start of a seed, without those that fail."""
         start = self._simulator.start(spec_of_seed(self._environment.environment.card, seed))
         chosen = [policy for policy in self.policies if policy.name in names]
-        open_loop = [policy for policy in chosen if isinstance(policy, ScriptedPolicy)]
-        episodes = [self._play(start, policy) for policy in open_loop]
-        branches = self._branches(start, seed) if DECISION in names else []
-        rows = [each.actions for each in episodes] + [rows for _, rows in branches]
+        episodes: dict[str, PolicyEpisode] = {}
+        for policy in (each for each in chosen if isinstance(each, ScriptedPolicy)):
+            with left.trying(policy.name, seed):
+                episodes[policy.name] = self._play(start, policy)
+        branches: list[tuple[str, NDArray[np.float32]]] = []
+        if DECISION in names:
+            with left.trying(DECISION, seed):
+                branches = self._branches(start, seed)
+        rows = [each.actions for each in episodes.values()] + [rows for _, rows in branches]
         outcomes = self._model.replay(start, rows) if rows else []
         lines: list[Line] = []
-        for policy, true, seen in zip(open_loop, episodes, outcomes, strict=False):
-            lines.append(self._line(policy.name, seed, "open", start, true, seen))
+        for (name, true), seen in zip(episodes.items(), outcomes, strict=False):
+            lines.append(self._line(name, seed, "open", start, true, seen))
         for policy in (each for each in chosen if isinstance(each, OwnPolicy)):
-            true = self._simulator.play_own(start, policy, self._steps)
-            seen = self._model.perform(start, policy, self._steps)
-            lines.append(self._line(policy.name, seed, "closed", start, true, seen))
+            with left.trying(policy.name, seed):
+                true = self._simulator.play_own(start, policy, self._steps)
+                seen = self._model.perform(start, policy, self._steps)
+                lines.append(self._line(policy.name, seed, "closed", start, true, seen))
         if branches:
             lines.append(self._decision(start, seed, branches, outcomes[len(episodes) :]))
         return lines
@@ -111,7 +120,8 @@ class Ranker:
 
     def _branches(self, start: Start, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
         """The script's own actions and their alternatives, `[T, A]` each."""
-        other = self._simulator.start(spec_of_seed(self._environment.environment.card, seed + 1))
+        card = self._environment.environment.card
+        other = first_start(self._simulator, card, range(seed + 1, seed + 1 + TRIED_SEEDS))
         rows = [self._play(each, self._script).actions for each in (other, start)]
         self._simulator.start(start.spec, start.goal)
         inner = self._environment.environment
@@ -173,7 +183,7 @@ def rank_policies(
         environment = TaskEnvironment(inner, goal_task)
         stride = world.codec.temporal_stride
         simulator = SimulatorJudge(environment, world.context_frames, stride, estimator)
-        solved = is_solvable(inner, goal_task, _first_goal(simulator, bundle.card, seeds))
+        solved = is_solvable(inner, goal_task, first_start(simulator, bundle.card, seeds).goal)
         chosen = _parse_policies(policies, solved, goal_task, bundle.card)
         script = ScriptedPolicy("solution" if solved else "behaviour")
         model = ModelJudge(world, estimator, goal_task, steps=steps)
@@ -190,12 +200,12 @@ def rank_policies(
         inner.close()
 
 
-def _first_goal(simulator: SimulatorJudge, card: EnvironmentCard, seeds: Sequence[int]) -> Goal:
-    """The goal of the first seed that is not solved at its start."""
+def first_start(simulator: SimulatorJudge, card: EnvironmentCard, seeds: Sequence[int]) -> Start:
+    """The start of the first seed that is not solved there."""
     for seed in seeds[:-1]:
         with contextlib.suppress(SolvedAtStartError):
-            return simulator.start(spec_of_seed(card, seed)).goal
-    return simulator.start(spec_of_seed(card, seeds[-1])).goal
+            return simulator.start(spec_of_seed(card, seed))
+    return simulator.start(spec_of_seed(card, seeds[-1]))
 
 
 def _parse_policies(
@@ -223,11 +233,12 @@ def _roll_out(
     finished = {(str(line["policy"]), int(line["seed"])) for line in results.finished()}
     missing = {seed: [n for n in ranker.names() if (n, seed) not in finished] for seed in seeds}
     total, count = len(seeds) * len(ranker.names()), sum(map(len, missing.values()))
+    left = LeftOut()
     what = f"ranking at {results.settings['task']}"
     with progress_bar(what, total, done=total - count, shown=progress) as advance:
         for seed in (seed for seed, names in missing.items() if names):
-            try:
-                results.add(*ranker.lines(seed, missing[seed]))
-            except SolvedAtStartError as error:
-                warnings.warn(f"{error}: seed {seed} is left out", AcwmWarning, stacklevel=2)
+            with left.trying("every policy", seed):
+                results.add(*ranker.lines(seed, missing[seed], left))
             advance(len(missing[seed]))
+    if left.error and not results.finished():
+        raise left.error
