@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import ActionSpec, Environment
+from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import noting
 from acwm_core.evaluation.clips import Clip, Predictor, cut_episode, donor_actions, read_clips
@@ -92,6 +93,26 @@ def plan_branches(
     return [branch for branch in branches if not np.array_equal(branch.actions, actions)]
 
 
+def branches_of(
+    environment: Environment, clip: Clip, whole: Episode, episodes: EpisodeDataset, frames: int
+) -> tuple[Episode, list[Branch]]:
+    """A clip's part `whole` of its episode, cut to at most `frames` frames, and its branches."""
+    length = min(frames, len(whole.video))
+    episode = cut_episode(whole, 0, length)
+    environment.reset(options={"spec": episode.spec})
+    free = slice(clip.given - 1, length)
+    planned = plan_branches(
+        episode.actions[free],
+        donor_actions(clip, whole.actions, episodes)[free],
+        environment.still_action(),
+        environment.card.action,
+    )
+    common = episode.actions[: free.start]
+    return episode, [
+        replace(branch, actions=np.concatenate([common, branch.actions])) for branch in planned
+    ]
+
+
 def simulate_branches(
     environment: Environment,
     clips: Sequence[Clip],
@@ -101,22 +122,10 @@ def simulate_branches(
 ) -> Iterator[Simulated]:
     """Simulate each clip again, cut to at most `frames` frames, and its branches."""
     for clip, whole in read_clips(clips, episodes):
-        length = min(frames, len(whole.video))
-        episode = cut_episode(whole, 0, length)
-        environment.reset(options={"spec": episode.spec})
-        free = slice(clip.given - 1, length)
-        branches = [
-            replace(branch, actions=np.concatenate([episode.actions[: free.start], branch.actions]))
-            for branch in plan_branches(
-                episode.actions[free],
-                donor_actions(clip, whole.actions, episodes)[free],
-                environment.still_action(),
-                environment.card.action,
-            )
-        ]
+        episode, branches = branches_of(environment, clip, whole, episodes, frames)
         truths: list[Prediction] = []
         for actions in [episode.actions, *(branch.actions for branch in branches)]:
-            made = simulate(environment, episode.spec, actions, frames=length)
+            made = simulate(environment, episode.spec, actions, frames=len(episode.video))
             truths.append(Prediction.truth(made, environment.card, estimator, clip))
         yield branches, replace(truths[0], branches=tuple(truths[1:]))
 

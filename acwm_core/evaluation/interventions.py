@@ -14,6 +14,7 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.environment import Environment
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.evaluation.clips import Clip, as_clip, read_clips
+from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.counterfactual import (
     ROWS,
     counterfactual,
@@ -88,13 +89,12 @@ def simulator_of(episodes: EpisodeDataset, tried: int = 0) -> Environment:
     return environment
 
 
-def asked_clips(evaluator: Evaluator, clips: Clips) -> dict[str, Clips]:
+def asked_clips(config: EvaluationConfig, clips: Clips) -> dict[str, Clips]:
     """The clips of each test, by test and split.
 
     The counterfactual test takes the first clips that start at their episode's first frame. The
     perturbed test takes the first clips, but none under a protocol whose clips may start later.
     """
-    config = evaluator.config
     moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
     return {
         COUNTERFACTUAL: {
@@ -108,7 +108,8 @@ def asked_clips(evaluator: Evaluator, clips: Clips) -> dict[str, Clips]:
 def units_of_work(evaluator: Evaluator, clips: Clips) -> int:
     """Upper bound of the progress that `intervene` reports to `Evaluator.advance`, in rows."""
     branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
-    count = {n: sum(map(len, each.values())) for n, each in asked_clips(evaluator, clips).items()}
+    asked = asked_clips(evaluator.config, clips)
+    count = {name: sum(map(len, each.values())) for name, each in asked.items()}
     return branches * count[COUNTERFACTUAL] + count[PERTURBED]
 
 
@@ -118,7 +119,7 @@ def intervene(
     """Run the tests that need the simulator, if it is available and the config asks for them."""
     config, card, found = evaluator.config, evaluator.card, Interventions()
     metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
-    asked = {n: s for n, s in asked_clips(evaluator, clips).items() if any(s.values())}
+    asked = {n: s for n, s in asked_clips(config, clips).items() if any(s.values())}
     if not metrics:
         asked.pop(COUNTERFACTUAL, None)
     if not asked:

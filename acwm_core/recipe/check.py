@@ -84,15 +84,20 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         if section != "env" or recipe.get(section):  # env is optional: datasets know theirs
             _component(section, recipe.get(section))
     values = {section: dict(_mapping(section, recipe.get(section) or {})) for section in plain}
-    for section, target in SECTIONS.items():
-        config = resolve_name(target)
-        removed = REMOVED.get(section, {})
-        values[section] = without_removed(values[section], removed, f"{section}.")
-        values[section] = _check(section, signature(config), values[section])
-        config(**values[section])  # checks ranges and combinations, which types cannot express
+    for section in SECTIONS:
+        values[section] = check_section(section, values[section])
     values["trainer"] = _ordered_flags(values["trainer"])
     for config in _metrics(values["evaluation"]).values():
         catalog().component("metric", config.component.partition(".")[0])
+    return values
+
+
+def check_section(section: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the values of one of `SECTIONS`; return them with all defaults."""
+    config = resolve_name(SECTIONS[section])
+    values = without_removed(dict(given), REMOVED.get(section, {}), f"{section}.")
+    values = _check(section, signature(config), values)
+    config(**values)  # checks ranges and combinations, which types cannot express
     return values
 
 

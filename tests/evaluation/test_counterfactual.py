@@ -234,7 +234,7 @@ def test_only_clips_that_begin_with_their_episode_are_asked_about():
     starts = [(0, 0), (0, 12), (1, 0), (2, 0)]
     plans = [Clip("ind_test", e, s, 9, donor=3, donor_start=0, seed=1) for e, s in starts]
     evaluator = Evaluator(None, Disc.card, {}, EvaluationConfig(counterfactual_episodes=2))
-    found = asked_clips(evaluator, {"ind_test": plans})["counterfactual"]
+    found = asked_clips(evaluator.config, {"ind_test": plans})["counterfactual"]
     assert [plan.episode for plan in found["ind_test"]] == [0, 1]
 
 

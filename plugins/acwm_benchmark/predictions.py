@@ -1,0 +1,139 @@
+"""Predictions as participants hand them in: found by the ids of tasks, checked, and read."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_benchmark.tasks import Task, World
+from acwm_benchmark.videos import CONTAINERS, NPZ, Coding, coding_of, read_whole
+from acwm_core.data.shards import file_sha256
+from acwm_core.errors import DataError, suggest
+
+TOLD = 5
+"""How many faults are told in one error."""
+
+_DRAW = re.compile(r"(.+)\.(\d+)")
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The predictions of one world's tasks: for each id the file or folder of each draw."""
+
+    world: World
+    tasks: Mapping[str, Task]
+    files: Mapping[str, Sequence[Path]]
+
+    @property
+    def draws(self) -> int:
+        """The number of draws of every task."""
+        return len(next(iter(self.files.values())))
+
+    @cached_property
+    def coding(self) -> Coding | None:
+        """How the videos are coded; None if nothing is lost (PNG, NPZ)."""
+        first, *others = [path for paths in self.files.values() for path in paths]
+        found = coding_of(first)
+        for path in others:
+            if coding_of(path) != found:
+                raise DataError(
+                    f"{path} is {coding_of(path) or 'lossless'}, but {first} is "
+                    f"{found or 'lossless'}: hand all predictions of a world in in one way"
+                )
+        return found
+
+    @cached_property
+    def checksum(self) -> str:
+        """SHA-256 of all files and their names."""
+        digest = hashlib.sha256()
+        for path in sorted(path for paths in self.files.values() for path in paths):
+            for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+                digest.update(f"{path.name}/{file.name}\0{file_sha256(file)}".encode())
+        return digest.hexdigest()
+
+    def video(self, task: str, draw: int = 0) -> NDArray[np.float32]:
+        """A prediction, `[T, H, W, 3]` in [0, 1].
+
+        Raises:
+            DataError: it is not what the task asks for; names the clip.
+        """
+        return read_whole(self.files[task][draw], task, self.tasks[task].frames, self.world)
+
+    def check(self) -> None:
+        """Read every prediction.
+
+        Raises:
+            DataError: some are wrong; a sentence for each.
+        """
+        faults: list[str] = []
+        for task, paths in self.files.items():
+            for draw in range(len(paths)):
+                try:
+                    self.video(task, draw)
+                except DataError as error:
+                    faults.append(str(error))
+        _refuse(faults)
+
+
+def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predictions:
+    """Find the predictions of a world's tasks below a folder.
+
+    Raises:
+        DataError: one is missing or is there twice, one is of no task, or numbers of draws differ.
+    """
+    place, wanted = folder / world.name, {task.id: task for task in tasks}
+    if not place.is_dir():
+        raise DataError(
+            f"{folder} holds no predictions of {world.name} (no folder {place}): add them, or name "
+            "the worlds to score"
+        )
+    found: dict[str, dict[int, Path]] = {}
+    faults: list[str] = []
+    for path in sorted(place.iterdir()):
+        if path.name.startswith("."):
+            continue
+        name, draw = _named(path, world.name, wanted)
+        if name not in wanted:
+            faults.append(f"{path} is of no task{suggest(name, wanted)}")
+        elif draw in found.setdefault(name, {}):
+            faults.append(f"{name}: {found[name][draw].name} and {path.name} are both of it")
+        else:
+            found[name][draw] = path
+    faults += [f"{name}: its prediction is missing" for name in wanted if name not in found]
+    faults += _of_draws(found)
+    _refuse(faults)
+    return Predictions(
+        world, wanted, {name: [found[name][n] for n in sorted(found[name])] for name in wanted}
+    )
+
+
+def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:
+    """The id of a prediction's file or folder, and the number of its draw."""
+    name = path.name
+    if path.is_file() and path.suffix.lower() in (*CONTAINERS, NPZ):
+        name = path.stem
+    task = f"{world}/{name}"
+    draw = _DRAW.fullmatch(task)
+    return (draw[1], int(draw[2])) if draw and task not in wanted else (task, 0)
+
+
+def _of_draws(found: Mapping[str, Mapping[int, Path]]) -> list[str]:
+    most = max((len(each) for each in found.values()), default=0)
+    return [
+        f"{name}: draws {', '.join(map(str, each))} are there, not 0 to {most - 1} as of others"
+        for name, each in found.items()
+        if sorted(each) != list(range(most))
+    ]
+
+
+def _refuse(faults: Sequence[str]) -> None:
+    if faults:
+        more = f"; and {len(faults) - TOLD} more" if len(faults) > TOLD else ""
+        raise DataError("; ".join(faults[:TOLD]) + more)

@@ -1,0 +1,145 @@
+"""A folder of tasks: what a participant is given, and nothing of the truth.
+
+TASKS/README.md, benchmark.json, index.jsonl, SHA256SUMS
+TASKS/WORLD/ID.png           the first frame (ID-0.png … ID-K.png for several)
+TASKS/WORLD/ID.npz           the actions
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.shards import file_sha256
+from acwm_core.errors import DataError, suggest
+from acwm_core.files import inside, parse_json, read_json, typed
+
+BENCHMARK, INDEX, SUMS, README = "benchmark.json", "index.jsonl", "SHA256SUMS", "README.md"
+
+
+@dataclass(frozen=True)
+class World:
+    """One world of a benchmark, without its tasks.
+
+    Attributes:
+        name: registered name of the environment.
+        summary: what it is, for people.
+        size: height and width of frames.
+        fps: frames per second.
+        actions: names, units, low and high bounds and kind of the action's dimensions.
+        evaluation: the settings of its evaluation, as `EvaluationConfig` takes them.
+        checksums: SHA-256 of the true test data, by split.
+        episodes: number of episodes of that data, by split.
+        branch_frames: the most frames of a counterfactual branch.
+        source: kind and name of recorded data; empty if the data was simulated.
+        seed: the seed of the data; None if it is secret, or if the data was recorded.
+    """
+
+    name: str
+    summary: str
+    size: tuple[int, int]
+    fps: float
+    actions: dict[str, Any]
+    evaluation: dict[str, Any]
+    checksums: dict[str, str]
+    episodes: dict[str, int]
+    branch_frames: int
+    source: dict[str, Any] = field(default_factory=dict[str, Any])
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One clip to predict: a line of the index.
+
+    Attributes:
+        id: ``WORLD/NAME``; the name of its files, and of the prediction's.
+        world: registered name of the environment.
+        frames: number of frames of the whole clip, T, the given ones included.
+        given: number of given first frames, K.
+        images: the files of the given frames, PNG.
+        actions: the NPZ file with ``actions`` `[T, A]`; row i leads from frame i to i + 1, and the
+            last one, which leads to no frame, is zero.
+        seed: seeds noise if a model has any; equal for all tasks that start from the same clip.
+    """
+
+    id: str
+    world: str
+    frames: int
+    given: int
+    images: list[str]
+    actions: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """``benchmark.json``: all worlds by name, and the version of the layout."""
+
+    worlds: dict[str, World]
+    version: int = 1
+
+
+class Tasks:
+    """A folder of tasks that `acwm benchmark export` wrote.
+
+    Raises:
+        DataError: there is none, or it is damaged.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        try:
+            self.benchmark = read_json(self.folder / BENCHMARK, Benchmark, "the benchmark")
+            lines = (self.folder / INDEX).read_text(encoding="utf-8").splitlines()
+            self.all = [typed(parse_json(line), Task) for line in lines]
+        except OSError:
+            raise DataError(
+                f"{self.folder} holds no tasks ({BENCHMARK}, {INDEX}): make them with "
+                "`acwm benchmark export`, or take the organiser's folder"
+            ) from None
+        except ValueError as error:
+            raise DataError(f"{self.folder / INDEX} is damaged ({error})") from error
+
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of the index."""
+        return file_sha256(self.folder / INDEX)
+
+    def worlds(self, names: Sequence[str] = ()) -> list[World]:
+        """The worlds with these names, all by default; a `DataError` for others."""
+        known = self.benchmark.worlds
+        for name in names:
+            if name not in known:
+                raise DataError(f"{self.folder} has no tasks of {name!r}{suggest(name, known)}")
+        return [known[name] for name in (names or known)]
+
+    def of(self, world: str) -> list[Task]:
+        """The tasks of a world."""
+        return [task for task in self.all if task.world == world]
+
+    def actions(self, task: Task) -> NDArray[np.float32]:
+        """The actions of a task, `[T, A]`."""
+        path = inside(self.folder, task.actions)
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                return arrays["actions"]
+        except (OSError, ValueError, LookupError) as error:
+            raise DataError(f"{path} cannot be read ({error}): export the tasks again") from error
+
+
+def write_index(folder: Path, worlds: Mapping[str, World], tasks: Iterable[Task]) -> None:
+    """Write ``benchmark.json``, the index and, last, the checksums of all files."""
+    text = json.dumps(asdict(Benchmark(dict(worlds))), indent=1, ensure_ascii=False)
+    (folder / BENCHMARK).write_text(text + "\n", encoding="utf-8")
+    lines = [json.dumps(asdict(task)) + "\n" for task in tasks]
+    (folder / INDEX).write_text("".join(lines), encoding="utf-8")
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    sums = [f"{file_sha256(path)}  {path.relative_to(folder).as_posix()}\n" for path in files]
+    (folder / SUMS).write_text("".join(sums), encoding="utf-8")
