@@ -28,7 +28,7 @@ ENDING_SECONDS = 2.0
 
 OF_THE_DISK = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG),
-    errno.ENAMETOOLONG,
+    *(errno.ENAMETOOLONG, errno.ENOTDIR),
 )
 """Errors that mean the file cannot be written, whatever its content."""
 

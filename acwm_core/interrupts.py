@@ -1,10 +1,11 @@
-"""How a command's process starts and ends: Ctrl-C at any moment, and no module from the folder."""
+"""How a command's process starts and ends: Ctrl-C, warnings, and no module from the folder."""
 
 from __future__ import annotations
 
 import os
 import signal
 import sys
+import warnings
 from types import FrameType
 from typing import NoReturn
 
@@ -18,7 +19,19 @@ SHOW_CURSOR = b"\x1b[?25h"
 def begin_process() -> None:
     """Prepare the process of a command, before anything heavy is imported."""
     os.environ["PYTHONSAFEPATH"] = "1"  # no child imports modules from the working folder
+    _keep_warnings_from_being_errors()
     handle_interrupts()
+
+
+def _keep_warnings_from_being_errors() -> None:
+    """Forget PYTHONWARNINGS=error, here and in children: other libraries warn where they please."""
+    if any(option.startswith("e") for option in sys.warnoptions):
+        sys.warnoptions.clear()
+        os.environ.pop("PYTHONWARNINGS", None)
+        warnings.resetwarnings()
+        hidden = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+        for usual in hidden:  # as Python does by itself
+            warnings.simplefilter("ignore", usual)
 
 
 def handle_interrupts() -> None:

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.files import parse_json
+from acwm_core.files import disk_error, parse_json
 from acwm_core.model.shapes import check_finite
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
@@ -132,6 +132,9 @@ def _downloaded(repository: str, codec: str) -> Path:
         for name in (CONFIGURATION, TENSORS):
             found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
     except Exception as error:  # the HTTP library raises many kinds of errors
+        if full := disk_error(error):
+            where = f"the Hub's cache cannot be written ({full.strerror})"
+            raise DataError(f"codec {codec!r}: {where}; set HF_HOME to another folder") from None
         raise DataError(
             f"codec {codec!r}: {repository} is not a local file or folder, and downloading it from "
             f"the Hub failed ({first_line(error).rstrip('. ')}); download it on another machine "

@@ -1,16 +1,13 @@
 """The physics of the reacher: two links that turn in a horizontal plane, driven by torques."""
 
 import copy
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
-os.environ.setdefault("MUJOCO_GL", "disabled")
-
 import numpy as np
-from mujoco import MjData, MjModel, mj_copyData, mj_inverse, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
+
+from acwm_sim.mujoco import mujoco
 
 TIMESTEP = 1 / 200
 """Seconds per fourth-order Runge-Kutta step; energy is then conserved to 1e-6 over an episode."""
@@ -59,21 +56,21 @@ class Arm:
     def __init__(self, links: Links, angles: Vector, goal: Vector | None = None) -> None:
         self.links = links
         self.goal = np.zeros(2) if goal is None else goal
-        self.model = MjModel.from_xml_string(_xml(links))
-        self.data = MjData(self.model)
-        self._scratch = MjData(self.model)
+        self.model = mujoco.MjModel.from_xml_string(_xml(links))
+        self.data = mujoco.MjData(self.model)
+        self._scratch = mujoco.MjData(self.model)
         self.data.qpos[:] = angles
 
     def advance(self, torque: Vector, seconds: float) -> None:
         """Apply constant torques ([2], N·m) for some seconds."""
         self.data.ctrl[:] = torque
         for _ in range(round(seconds / TIMESTEP)):
-            mj_step(self.model, self.data)
+            mujoco.mj_step(self.model, self.data)
 
     def snapshot(self) -> Callable[[], None]:
         """A function that returns to this moment."""
         data = copy.copy(self.data)
-        return lambda: mj_copyData(self.data, self.model, data)
+        return lambda: mujoco.mj_copyData(self.data, self.model, data)
 
     @property
     def angles(self) -> Vector:
@@ -89,7 +86,7 @@ class Arm:
         """The torques [2] in N·m that cause these accelerations (rad/s²) in this state."""
         data = self._scratch
         data.qpos[:], data.qvel[:], data.qacc[:] = angles, velocities, accelerations
-        mj_inverse(self.model, data)
+        mujoco.mj_inverse(self.model, data)
         return data.qfrc_inverse.copy()
 
     def points(self, angles: Vector) -> Vector:

@@ -1,18 +1,15 @@
 """The physics of push_cube: sliding cubes, walls, and pushers that follow a target."""
 
 import copy
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-
-# MuJoCo would otherwise look for OpenGL on import; frames come from acwm_sim.
-os.environ.setdefault("MUJOCO_GL", "disabled")
+from typing import Any
 
 import numpy as np
-from mujoco import MjData, MjModel, mj_copyData, mj_forward, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from numpy.typing import NDArray
 
 from acwm_rigid.physics import INNER, PUSHER_RADIUS
+from acwm_sim.mujoco import mujoco
 
 WALL = 0.015
 """Half thickness of a wall, metres."""
@@ -66,8 +63,8 @@ class PushSimulation:
 
     def __init__(self, cubes: Cubes, pushers: NDArray[np.float64]) -> None:
         self.cubes = cubes
-        self.model = MjModel.from_xml_string(_xml(cubes, len(pushers)))
-        self.data = MjData(self.model)
+        self.model = mujoco.MjModel.from_xml_string(_xml(cubes, len(pushers)))
+        self.data = mujoco.MjData(self.model)
         self._pushers = len(pushers)
         self._instance = _instances(self.model, cubes, len(pushers))
         self.reference = np.array(pushers, np.float64)
@@ -75,7 +72,7 @@ class PushSimulation:
         places = self.data.qpos[2 * self._pushers :].reshape(-1, 4)
         places[:, :2], places[:, 2], places[:, 3] = cubes.xy, cubes.edge / 2, cubes.yaw
         self.data.ctrl[:] = self.reference.ravel()
-        mj_forward(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
 
     def advance(self, target: NDArray[np.float64], seconds: float) -> set[tuple[int, int]]:
         """Move the pushers towards `target` ([P, 2], metres) for some seconds.
@@ -96,7 +93,7 @@ class PushSimulation:
         self.reference = path[-1]
         for point in path.reshape(len(path), -1):
             self.data.ctrl[:] = point
-            mj_step(self.model, self.data)
+            mujoco.mj_step(self.model, self.data)
             meetings.add(self.data.contact.geom.tobytes())
         geoms = np.frombuffer(b"".join(meetings), np.int32).reshape(-1, 2)
         return {(a, b) for a, b in self._instance[geoms].tolist() if min(a, b) > 0}
@@ -106,7 +103,7 @@ class PushSimulation:
         data, reference = copy.copy(self.data), self.reference
 
         def back() -> None:
-            mj_copyData(self.data, self.model, data)
+            mujoco.mj_copyData(self.data, self.model, data)
             self.reference = reference
 
         return back
@@ -139,11 +136,11 @@ class PushSimulation:
     @property
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World positions [P + n, 3] and rotations [P + n, 3, 3] of pushers, then cubes."""
-        mj_kinematics(self.model, self.data)
+        mujoco.mj_kinematics(self.model, self.data)
         return self.data.xpos[1:].copy(), self.data.xmat[1:].reshape(-1, 3, 3).copy()
 
 
-def _instances(model: MjModel, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
+def _instances(model: Any, cubes: Cubes, pushers: int) -> NDArray[np.int64]:
     """Instance id of every geom; the names of geoms start with what they belong to."""
     first_cube = FIRST_BODY_ID + pushers
     ids = {"table": 0, "wall": WALL_ID}

@@ -4,18 +4,26 @@ import contextlib
 import functools
 import io
 import os
+import tempfile
 import threading
+import warnings
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+from acwm_core.errors import AcwmError, AcwmWarning
+from acwm_sim.shell import undisturbed
 
-from acwm_core.errors import AcwmError
+CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
+"""Environment variable for the folder of compiled kernels, the only one of Taichi's that counts."""
+
+_VARIABLES = ("TI_", "ENABLE_TAICHI")  # they change results, and where and how fast it computes
 
 try:
-    import taichi as ti
-    from taichi.lang import impl, kernel_impl
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0"):
+        import taichi as ti
+        from taichi.lang import impl, kernel_impl
+        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 except ImportError as error:
     if "libX11" in str(error):
         raise AcwmError(
@@ -24,7 +32,7 @@ except ImportError as error:
         ) from error
     raise
 
-__all__ = ["start", "ti"]
+__all__ = ["CACHE", "start", "ti"]
 
 # Taichi reads the source of a function at each of its calls, and draws each expression as text for
 # the case of an error: more than half of the time before the first frame. Neither ends in a kernel.
@@ -67,15 +75,45 @@ def start() -> None:
             "use processes (spawn), not threads, to simulate in parallel"
         )
     if impl.get_runtime().prog is None:  # otherwise someone else has already started it
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints to stdout, which may be data
-            ti.init(
-                arch=ti.cpu,
-                cpu_max_num_threads=1,
-                offline_cache=True,
-                log_level=ti.ERROR,
-                random_seed=0,
-            )
+        _initialise()
         # Taichi keeps what it compiled on disk when it is torn down; at the end of a process with
         # torch and an environment it is not. Unlike atexit, Finalize also runs in workers.
         Finalize(None, ti.reset, exitpriority=0)
     _started_in = os.getpid()
+
+
+def _initialise() -> None:
+    folder = _cache()
+    # It would ask its makers for a newer version, and it prints to stdout, which may be data.
+    with (
+        undisturbed(*_VARIABLES, TI_SKIP_VERSION_CHECK="ON"),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
+        ti.init(
+            arch=ti.cpu,
+            cpu_max_num_threads=1,
+            offline_cache=True,
+            offline_cache_file_path=str(folder),
+            log_level=ti.ERROR,
+            random_seed=0,
+        )
+
+
+def _cache() -> Path:
+    """The folder of compiled kernels; a temporary one, with a warning, if it cannot be written."""
+    folder = Path(os.environ.get(CACHE) or impl.default_cfg().offline_cache_file_path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        warnings.warn(
+            f"compiled kernels cannot be kept in {folder} ({error.strerror}), so every command "
+            f"compiles its own, in 10 to 20 seconds: set {CACHE} to another folder",
+            AcwmWarning,
+            stacklevel=2,
+        )
+        temporary = tempfile.TemporaryDirectory(prefix="acwm-")
+        Finalize(None, temporary.cleanup, exitpriority=-1)  # after Taichi has written there
+        os.environ[CACHE] = temporary.name  # also of child processes
+        return Path(temporary.name)

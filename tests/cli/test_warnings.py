@@ -1,5 +1,7 @@
 """Warnings are one line: of old spellings, which work for one more release, and all other."""
 
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,3 +77,20 @@ def test_options(
 def test_an_old_spelling_is_told_once() -> None:
     old = Path("tests/reference/before_objectives/next_frame/recipe.yaml")
     assert "flow" in warning("show", str(old), "flow.shift=7")
+
+
+def test_no_warning_of_another_library_ends_a_command() -> None:
+    """As with PYTHONWARNINGS=error, which children would inherit."""
+    code = """
+from acwm_core.interrupts import begin_process
+begin_process()
+import os, sys, warnings
+warnings.warn("old", DeprecationWarning)
+warnings.warn("new")
+print(sys.warnoptions, os.environ.get("PYTHONWARNINGS"))
+"""
+    words = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout == "[] None\n"
+    assert "UserWarning: new" in done.stderr
+    assert "old" not in done.stderr

@@ -5,6 +5,7 @@ import functools
 import hashlib
 import http.server
 import json
+import os
 import sys
 import threading
 
@@ -154,6 +155,25 @@ def cached(server, run, data, tmp_path):
     (recipe,) = (tmp_path / "cache").rglob("recipe.yaml")
     assert recipe.is_symlink()
     return recipe.parent
+
+
+def test_a_cache_that_is_read_only(cached, monkeypatch):
+    before = {file: file.is_symlink() for file in cached.rglob("*")}
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    fetched = hub.fetch("org/name")
+    assert files(fetched) == KEPT
+    assert not any(file.is_symlink() for file in fetched.rglob("*"))
+    assert {file: file.is_symlink() for file in cached.rglob("*")} == before
+
+
+def test_a_cache_that_cannot_be_made_is_one_sentence(server, tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "file" / "cache"))
+    server.content["recipe.yaml"] = b""
+    with pytest.raises(TrainingError, match="set HF_HOME to another folder"):
+        hub.fetch("org/name")
 
 
 def test_a_fetch_that_is_stopped_leaves_no_half_a_file(cached, monkeypatch):

@@ -1,0 +1,92 @@
+"""Simulators give the same bytes whatever the shell says, each shell in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.ci
+
+SCRIPT = Path(__file__).with_name("drawing_worlds.py")
+WORLDS = ("reacher", "push_rope", "stack_cube")
+"""MuJoCo, Taichi and PyBullet; all are drawn by Taichi."""
+
+SHELLS = {
+    "of Taichi": {
+        "TI_ADVANCED_OPTIMIZATION": "0",
+        "TI_ARCH": "vulkan",
+        "TI_DEBUG": "1",
+        "TI_DEFAULT_FP": "64",
+        "TI_FAST_MATH": "0",
+        "TI_LOG_LEVEL": "trace",
+        "TI_MAX_BLOCK_DIM": "banana",
+        "ENABLE_TAICHI_HEADER_PRINT": "1",
+    },
+    "of OpenGL": {
+        "DISPLAY": ":77",
+        "LIBGL_ALWAYS_INDIRECT": "1",
+        "MUJOCO_GL": "osmesa",
+        "PYOPENGL_PLATFORM": "banana",
+    },
+    "of arithmetic": {
+        "MKL_NUM_THREADS": "3",
+        "OMP_DYNAMIC": "true",
+        "OMP_NUM_THREADS": "3",
+        "OMP_PROC_BIND": "spread",
+        "OPENBLAS_NUM_THREADS": "3",
+    },
+    "of Python": {
+        "LANG": "C",
+        "LC_ALL": "C",
+        "PYTHONCOERCECLOCALE": "0",
+        "PYTHONHASHSEED": "7",
+        "PYTHONOPTIMIZE": "2",
+        "PYTHONUTF8": "0",
+        "PYTHONWARNINGS": "error",
+        "TZ": "Asia/Kathmandu",
+    },
+}
+
+
+def drawn(folder, worlds=WORLDS, **variables):
+    """The digest of each world, and what was said about it."""
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *worlds],
+        cwd=folder,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=900,
+        umask=0o077,
+    )
+    assert done.returncode == 0, done.stderr
+    return dict(line.split() for line in done.stdout.splitlines()), done.stderr
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    digests, said = drawn(tmp_path_factory.mktemp("usual"))
+    assert [*digests] == [*WORLDS]
+    assert said == ""
+    return digests
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_variables(shell, usual, tmp_path):
+    folder = tmp_path / "große Übung"
+    folder.mkdir()
+    assert drawn(folder, **SHELLS[shell]) == (usual, "")
+
+
+def test_a_home_that_nothing_can_be_written_to(usual, tmp_path):
+    home = tmp_path / "file"
+    home.touch()
+    (temporary := tmp_path / "temporary").mkdir()
+    folders = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(temporary)}
+    digests, said = drawn(tmp_path, ["reacher"], **folders)
+    assert digests["reacher"] == usual["reacher"]
+    assert "set TI_OFFLINE_CACHE_FILE_PATH to another folder" in said
+    assert "Traceback" not in said
+    assert not [*temporary.iterdir()]
