@@ -1,4 +1,4 @@
-"""How good the recipe `small` becomes with how many training episodes (docs/your-own-data.md).
+"""How good the recipe `small` becomes with how many episodes (docs/findings/data-amount.md).
 
     python benchmarks/data_amount.py --out runs/amounts    # rows of plugins/acwm_report/needs.yaml
     python benchmarks/data_amount.py --out runs/amounts --only reacher --started push_rope

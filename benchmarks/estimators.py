@@ -2,7 +2,7 @@
 
     python benchmarks/estimators.py data/push_cube data/reacher_small
 
-Each row is a split of a dataset. The tables in docs/estimators.md are made by this program.
+Each row is a split of a dataset. It makes the table of docs/findings/estimators.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compare recipe overrides by what a small model learns in equal CPU time (docs/recipes.md).
+"""Compare overrides by what a small model learns in equal time (docs/findings/small-models.md).
 
     python benchmarks/learning.py --out runs/learning
     python benchmarks/learning.py --out runs/learning --recipe reacher --only Muon --seeds 3

@@ -1,4 +1,4 @@
-"""Plot training loss against CPU time for the runs of learning.py (figures of docs/recipes.md).
+"""Plot loss against CPU time of the runs of learning.py (docs/findings/what-learns-most.md).
 
     python benchmarks/learning_curves.py --out runs/learning --recipe reacher --figure reacher.svg
 

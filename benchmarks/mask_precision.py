@@ -4,7 +4,7 @@
 
 Draws frames of test episodes ten times as large as usual and takes the masks of small frames from
 them, once unchanged and once with everything shifted by 0.1 to 0.3 of a small pixel. The IoU of the
-two is the best that an estimator with this error can reach. docs/estimators.md quotes two rows.
+two is the best that an estimator with this error can reach (docs/findings/estimators.md).
 """
 
 from __future__ import annotations

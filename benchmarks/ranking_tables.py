@@ -1,4 +1,4 @@
-"""The tables of docs/policies.md: how well the models that ship rank 24 scripted policies.
+"""The tables of docs/findings/policies.md: how well the models that ship rank 24 scripted policies.
 
 python benchmarks/ranking_tables.py --list             # the commands
 python benchmarks/ranking_tables.py                    # run what is missing, print the tables

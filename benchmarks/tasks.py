@@ -1,4 +1,4 @@
-"""How often scripted solutions solve the tasks, with pictures: the table of docs/tasks.md.
+"""How often scripted solutions solve the tasks, with pictures: the table of docs/findings/tasks.md.
 
 python benchmarks/tasks.py --seeds 50                       # all tasks, from all environments
 python benchmarks/tasks.py push_cube.place --seeds 10 --pictures docs/tasks

@@ -4,7 +4,7 @@
 
 Simulates new test episodes, every other one out of distribution: each once unchanged, and once with
 every fault of `faults.py` from a third of its length on. It reads them with the estimators. The
-table in docs/physics.md is made by this program.
+table in docs/findings/physics.md is made by this program.
 """
 
 from __future__ import annotations

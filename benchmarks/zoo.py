@@ -1,4 +1,4 @@
-"""Scores of the shipped models as the table of docs/models.md, and a picture of predictions.
+"""The table of docs/findings/trained-models.md: scores of the models that ship; and a picture.
 
     python benchmarks/zoo.py
     python benchmarks/zoo.py --picture docs/zoo.jpg      # simulates some minutes

@@ -1,4 +1,4 @@
-"""Estimators on freshly simulated frames: bounds a way above the floors in docs/estimators.md."""
+"""Estimators on new frames: bounds a way above the floors in docs/findings/estimators.md."""
 
 import dataclasses
 import functools

@@ -324,7 +324,7 @@ def test_a_format_that_does_not_come_back_is_found():
 
 
 def test_the_one_in_the_documents_conforms(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "own-format.md").read_text()
     (code,) = [b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Npz" in b]
     (tmp_path / "documented_format.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -14,14 +14,15 @@ import yaml
 
 from acwm_core.cli import main
 from acwm_core.recipe import compose
+from acwm_templates.package import write_package
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
     *ROOT.glob("*.md"),
-    *ROOT.glob("docs/*.md"),
+    *ROOT.glob("docs/**/*.md"),
     *ROOT.glob("examples/*/README.md"),
 ]
-OUTSIDE = [path for path in DOCUMENTS if path.parent != ROOT / "docs"]
+OUTSIDE = [path for path in DOCUMENTS if ROOT / "docs" not in path.parents]
 
 
 def names(values):
@@ -85,7 +86,7 @@ def parse(command, words, line):
 def test_recipes_in_commands_are_valid(document):
     for line in commands(document):
         command, *rest = shlex.split(line)[1:] or [""]
-        if command not in ("fit", "show") or not rest or rest[0] in ("RECIPE", "…"):
+        if command not in ("fit", "show") or not rest or rest[0] in ("RECIPE", "…", "--help"):
             continue
         if rest[0].startswith("runs/"):  # the recipe of a run that the reader has made
             continue
@@ -142,10 +143,18 @@ def test_the_recipe_in_the_documents_is_valid(tmp_path):
 
 
 def test_code_of_the_example_is_quoted_as_it_is():
-    quoted = blocks(ROOT / "CONTRIBUTING.md", "python")[0]
+    quoted = blocks(ROOT / "docs" / "plugins.md", "python")[0]
     plugin = ROOT / "examples" / "acwm_pendulum" / "acwm_pendulum" / "plugin.py"
     code = re.sub(r'\n    """.*?"""', "", plugin.read_text())
     assert quoted.strip() in code
+
+
+def test_code_of_a_scene_is_quoted_as_acwm_new_writes_it(tmp_path):
+    folder = write_package("scene", "my_world", tmp_path / "acwm_my_world", "push_cube")
+    written = "".join(path.read_text() for path in folder.rglob("*.py"))
+    shown = blocks(ROOT / "docs" / "scenes.md", "python")
+    assert shown
+    assert [each for each in shown if each.strip("\n") not in written] == []
 
 
 def test_the_readme_is_short():
