@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
@@ -62,12 +62,13 @@ class MetricChecks(Suite):
 
     @classmethod
     def check(cls, component: Checked, *args: Any, **params: Any) -> Iterator[CheckResult]:
-        """As for every suite; metrics that compare sets have partly different checks."""
+        """As for every suite; metrics of sets and of draws have partly different checks."""
         if cls is not MetricChecks:
             return super().check(component, *args, **params)
-        target = cls(component).target
+        target: Any = cls(component).target
         of_sets = isinstance(target, type) and issubclass(target, SetMetric)
-        suite = SetMetricChecks if of_sets else ClipMetricChecks
+        of_draws = cast(Any, target).of_draws if isinstance(target, type) else False
+        suite = SetMetricChecks if of_sets else DrawsMetricChecks if of_draws else ClipMetricChecks
         return suite.check(component, *args, **params)
 
     @functools.cached_property
@@ -109,9 +110,9 @@ class MetricChecks(Suite):
         others = (replace(each, video=predict(each.target)) for each in branches)
         return replace(clip, video=predict(clip.target), branches=tuple(others))
 
-    def _noisy(self, amount: float) -> Prediction:
+    def _noisy(self, amount: float, seed: int = 0) -> Prediction:
         """Predictions with Gaussian noise of this standard deviation on all but the first frame."""
-        generator = torch.Generator().manual_seed(0)
+        generator = torch.Generator().manual_seed(seed)
 
         def predict(target: Clip) -> Clip:
             noise = torch.randn(target.shape, generator=generator) * amount
@@ -119,12 +120,6 @@ class MetricChecks(Suite):
             return (target + noise).clamp(0, 1)
 
         return self._predicted(predict)
-
-    def _is_better(self, value: float, best: float) -> bool:
-        """Whether a bad prediction scores better than the true video."""
-        if self._metric.higher_is_better:
-            return value > best
-        return value < (best if self._reads_pixels else best / 2)  # estimator errors vary
 
     def _to_be_scored(self, base: type[Metric]) -> Prediction:
         expect_is_a(self._metric, base)
@@ -145,6 +140,72 @@ class MetricChecks(Suite):
         expect_is_a(metric.higher_is_better, bool)
         known = get_args(Reads)
         expect(metric.reads in known, f"it reads {metric.reads!r}, which is none of {known}")
+
+    def scoring_repeats_and_leaves_no_trace(self) -> None:
+        """Give the same scores twice, without changing the inputs."""
+        prediction = self._noisy(0.1)
+        video, target = prediction.video.clone(), prediction.target.clone()
+        states = {name: values.copy() for name, values in prediction.states.items()}
+        first, second = (self._raw_scores(prediction) for _ in range(2))
+        expect(np.array_equal(first, second, equal_nan=True), "a second scoring differs")
+        same = torch.equal(video, prediction.video) and torch.equal(target, prediction.target)
+        expect(same, "it changes the video that it is given")
+        for name, values in states.items():
+            same = np.array_equal(values, prediction.states[name], equal_nan=True)
+            expect(same, f"it changes state {name!r}")
+
+
+class _ValueChecks(MetricChecks):
+    """Checks of a metric in which each clip has a score."""
+
+    def scores_a_clip(self) -> None:
+        """Construct the metric and score a clip, frame by frame and as a whole."""
+        prediction = self._to_be_scored(Metric)
+        scores, frames = self._metric.per_frame(prediction), len(prediction.target)
+        expect(np.shape(scores) == (frames,), f"{frames} frames got {np.shape(scores)} scores")
+        expect(np.isfinite(scores).any(), "no frame of a noisy prediction gets a finite score")
+        (low, high), value = self._metric.bounds, self._metric.value(prediction)
+        expect(low <= value <= high, f"the score {value:.4g} is outside its bounds {low} to {high}")
+
+    def summary_of_equals_is_their_value(self) -> None:
+        """Summarise equal values as that value."""
+        prediction = self._noisy(0.1)
+        value, weight = self._metric.value(prediction), self._metric.weight(prediction)
+        summary = self._metric.summarise([value] * 3, [weight] * 3)
+        same = math.isclose(summary, value, rel_tol=1e-6)
+        expect(same, f"three times {value:.4g} is {summary:.4g}")
+
+
+class _DrawChecks(MetricChecks):
+    """Checks of a metric on several draws of a clip."""
+
+    def _noisy(self, amount: float, seed: int = 0) -> Prediction:
+        made = [super(_DrawChecks, self)._noisy(amount, seed + draw) for draw in range(4)]
+        return replace(made[0], draws=tuple(made))
+
+    def draws_have_no_order(self) -> None:
+        """Score draws the same in any order, and otherwise than the first of them alone."""
+        prediction = self._noisy(0.1)
+        value = self._score(prediction)
+        turned = replace(prediction, draws=prediction.draws[::-1])
+        same = math.isclose(value, self._score(turned), rel_tol=1e-5)
+        expect(same, "the order of the draws matters")
+        alone = self._score(replace(prediction, draws=prediction.draws[:1]))
+        expect(value != alone, "it looks at one draw only")
+
+
+class DrawsMetricChecks(_ValueChecks, _DrawChecks):
+    """Checks of a metric that judges the draws of a clip together."""
+
+
+class _OrderChecks(MetricChecks):
+    """Checks of a metric that says which of two predictions is better."""
+
+    def _is_better(self, value: float, best: float) -> bool:
+        """Whether a bad prediction scores better than the true video."""
+        if self._metric.higher_is_better:
+            return value > best
+        return value < (best if self._reads_pixels else best / 2)  # estimator errors vary
 
     def truth_scores_best(self) -> None:
         """Score no bad prediction better than the true video, and some worse; equal sets score 0.
@@ -185,42 +246,12 @@ class MetricChecks(Suite):
         listed = ", ".join(f"{value:.4g}" for value in values)
         expect(in_order, f"with growing noise it goes {listed}")
 
-    def scoring_repeats_and_leaves_no_trace(self) -> None:
-        """Give the same scores twice, without changing the inputs."""
-        prediction = self._noisy(0.1)
-        video, target = prediction.video.clone(), prediction.target.clone()
-        states = {name: values.copy() for name, values in prediction.states.items()}
-        first, second = (self._raw_scores(prediction) for _ in range(2))
-        expect(np.array_equal(first, second, equal_nan=True), "a second scoring differs")
-        same = torch.equal(video, prediction.video) and torch.equal(target, prediction.target)
-        expect(same, "it changes the video that it is given")
-        for name, values in states.items():
-            same = np.array_equal(values, prediction.states[name], equal_nan=True)
-            expect(same, f"it changes state {name!r}")
 
-
-class ClipMetricChecks(MetricChecks):
+class ClipMetricChecks(_ValueChecks, _OrderChecks):
     """Checks of a metric that scores each clip."""
 
-    def scores_a_clip(self) -> None:
-        """Construct the metric and score a clip, frame by frame and as a whole."""
-        prediction = self._to_be_scored(Metric)
-        scores, frames = self._metric.per_frame(prediction), len(prediction.target)
-        expect(np.shape(scores) == (frames,), f"{frames} frames got {np.shape(scores)} scores")
-        expect(np.isfinite(scores).any(), "no frame of a noisy prediction gets a finite score")
-        (low, high), value = self._metric.bounds, self._metric.value(prediction)
-        expect(low <= value <= high, f"the score {value:.4g} is outside its bounds {low} to {high}")
 
-    def summary_of_equals_is_their_value(self) -> None:
-        """Summarise equal values as that value."""
-        prediction = self._noisy(0.1)
-        value, weight = self._metric.value(prediction), self._metric.weight(prediction)
-        summary = self._metric.summarise([value] * 3, [weight] * 3)
-        same = math.isclose(summary, value, rel_tol=1e-6)
-        expect(same, f"three times {value:.4g} is {summary:.4g}")
-
-
-class SetMetricChecks(MetricChecks):
+class SetMetricChecks(_OrderChecks):
     """Checks of a metric that compares sets of clips, on sideways shifts of one clip."""
 
     def _raw_scores(self, prediction: Prediction) -> NDArray[Any]:

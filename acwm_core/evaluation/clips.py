@@ -21,10 +21,21 @@ if TYPE_CHECKING:
     from acwm_core.data.dataset import EpisodeDataset
     from acwm_core.model import shapes
 
-Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
+Predictor = Literal[
+    "model",
+    "mean_of_draws",
+    "best_of_draws",
+    "shuffled",
+    "copy",
+    "codec",
+    "truth",
+    "perturbed",
+]
 """A row of the results, named after what made its prediction:
 
-* ``model``: the world model with the clip's actions.
+* ``model``: the world model with the clip's actions; if several draws are scored, their mean score.
+* ``mean_of_draws``: the mean frames of the model's draws.
+* ``best_of_draws``: in each metric, the draw of the clip that is best in it.
 * ``shuffled``: the same model and noise with another episode's actions.
 * ``copy``: the first frame, repeated.
 * ``codec``: the codec's reconstruction of the truth, a ceiling for every model that uses it.
@@ -33,6 +44,9 @@ Predictor = Literal["model", "shuffled", "copy", "codec", "truth", "perturbed"]
 * ``perturbed``: the simulator with the clip's actions, started slightly elsewhere, for a few clips.
   It shows what no model can predict.
 """
+
+DRAWN: tuple[Predictor, ...] = ("mean_of_draws", "best_of_draws")
+"""The rows that are made of the model's draws, after the row ``model``."""
 
 PREDICTORS: tuple[Predictor, ...] = ("model", "shuffled", "copy", "codec", "truth")
 """The rows that need only the dataset and the model."""
@@ -161,6 +175,12 @@ def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
     """The seed of one clip's sampling noise, independent of which other clips are evaluated."""
     identity = [seed, [*map(str, SPLITS)].index(split), episode, start]
     return int(np.random.SeedSequence(identity).generate_state(1)[0])
+
+
+def draw_seeds(seed: int, draws: int) -> list[int]:
+    """The seeds of several draws of a clip; the first is the clip's own seed."""
+    more = (np.random.SeedSequence([seed, draw]) for draw in range(1, draws))
+    return [seed, *(int(each.generate_state(1)[0]) for each in more)]
 
 
 def read_clips(clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[tuple[Clip, Episode]]:

@@ -14,7 +14,7 @@ from acwm_core.recipe.metrics import metric_configs
 
 MINIMA = {
     **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
-    **dict.fromkeys(("cuts", "steps", "batch_size", "context_frames"), 1),
+    **dict.fromkeys(("cuts", "steps", "batch_size", "context_frames", "samples"), 1),
     **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
     **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
 }
@@ -45,6 +45,11 @@ class EvaluationConfig:
             given. Only the last of them is scored. None takes as many as in training.
         cuts: clips per episode; only for protocols that cut windows.
         steps: sampling steps; None takes the flow's default.
+        samples: number of futures that are drawn of each clip. With more than one, the row
+            ``model`` has the mean score of the draws, beside the score of their mean frames and of
+            the best draw; and metrics that judge draws together are measured. A model that draws
+            none is predicted once and scored by the same rules. The test with other actions, the
+            curve of sampling steps and videos take one draw.
         steps_sweep: numbers of sampling steps at which a few clips are also predicted, for the
             curve of scores against steps. Empty for no curve; models without sampling steps have
             none. Metrics that read states from video are left out, unless one ranks the clips.
@@ -76,6 +81,7 @@ class EvaluationConfig:
     context_frames: int | None = None
     cuts: int | None = None
     steps: int | None = None
+    samples: int = 1
     steps_sweep: tuple[int, ...] = (1, 2, 4, 5, 10, 20, 50)
     sweep_episodes: int = 4
     batch_size: int = 8

@@ -23,6 +23,7 @@ from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.clips import PREDICTORS, Predictor, sound_clips
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.draws import metrics_for
 from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
 from acwm_core.evaluation.predict import Evaluator, VideoModel
 from acwm_core.evaluation.protocol import Published, published_for
@@ -204,9 +205,8 @@ def evaluator_of(
             "lists the usual ones, or add evaluation.metrics=[NAME] (see `acwm list metric`)"
         )
     estimator = estimator_for(card)
-    metrics, left_out = split_available(
-        build_metrics(config.metrics, config.metric_options), card, estimator
-    )
+    asked = build_metrics(config.metrics, config.metric_options)
+    metrics, left_out = split_available(metrics_for(asked, config.samples), card, estimator)
     of_views, too_small = metrics_of_views(metrics, card)
     return Evaluator(
         world_model,

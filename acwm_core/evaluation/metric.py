@@ -44,6 +44,8 @@ class Prediction:
         estimator: reads states and masks from video of this environment; None if there is none.
         branches: predictions of other actions from the same first frame, each with the video that
             the simulator makes of them as `target`; empty unless requested.
+        draws: all draws of the clip, of which `video` is the first; a single one if the model draws
+            none. Empty unless several are asked for.
         clip: which clip of an evaluation it is.
         kind: what predicted it there, see `acwm_core.evaluation.clips.Predictor`.
         ood_label: the factors of the episode that were shifted out of distribution, if any.
@@ -58,6 +60,7 @@ class Prediction:
     card: EnvironmentCard
     estimator: StateEstimator | None = None
     branches: tuple[Prediction, ...] = ()
+    draws: tuple[Prediction, ...] = ()
     clip: Clip = field(default_factory=Clip)
     kind: Predictor = "model"
     ood_label: str | None = None
@@ -90,6 +93,8 @@ class Prediction:
 
     def without(self, frames: int) -> Prediction:
         """The prediction without its first `frames` frames, as if the clip had begun later."""
+        if not frames:
+            return self  # with all that is known of it
         contacts = self.contacts - np.array([frames, 0, 0], self.contacts.dtype)
         return replace(
             self,
@@ -100,6 +105,7 @@ class Prediction:
             masks=self.masks[frames:],
             contacts=contacts[contacts[:, 0] >= 0],
             branches=tuple(branch.without(frames) for branch in self.branches),
+            draws=tuple(draw.without(frames) for draw in self.draws),
         )
 
     def check_shapes(self) -> None:
@@ -129,9 +135,9 @@ class Prediction:
 
     @functools.cached_property
     def is_finite(self) -> bool:
-        """Whether its video and those of all branches are free of NaN and infinity."""
+        """Whether its video and those of all branches and draws are free of NaN and infinity."""
         own = bool(self.video.isfinite().all())
-        return own and all(branch.is_finite for branch in self.branches)
+        return own and all(each.is_finite for each in (*self.branches, *self.draws))
 
     def once(self, key: object, work_out: Callable[[], Result]) -> Result:
         """Compute a value that several metrics of this clip share, only once.
@@ -169,6 +175,7 @@ class MetricInfo:
     factor: float | None = None
     rank: int = 100
     definition: int = 1
+    right: float | None = None
 
 
 class Metric(ABC):
@@ -189,7 +196,11 @@ class Metric(ABC):
         rank: its order in tables, lowest first; the metric with the lowest rank orders the clips.
         of_branches: whether it compares a clip with its branches. It is then measured only on the
             clips of the counterfactual test (`evaluation.counterfactual_metrics`).
+        of_draws: whether it judges the draws of a clip together (`Prediction.draws`). It is then
+            measured only if several are asked for (`evaluation.samples`). A prediction without
+            draws, such as the copied first frame, counts as one draw or is not defined.
         definition: number of its definition; scores of different ones do not compare.
+        right: the right score, where neither a higher nor a lower one is better; else None.
     """
 
     name: str
@@ -202,13 +213,15 @@ class Metric(ABC):
     factor: float | None = None
     rank: int = 100
     of_branches: bool = False
+    of_draws: bool = False
     definition: int = 1
+    right: float | None = None
 
     @property
     def info(self) -> MetricInfo:
         """What tables and charts need to know about it."""
         title = self.title or self.name.replace("_", " ").capitalize()
-        shown = self.group, self.reads, self.factor, self.rank, self.definition
+        shown = self.group, self.reads, self.factor, self.rank, self.definition, self.right
         return MetricInfo(self.unit, self.higher_is_better, title, *shown)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:

@@ -21,9 +21,11 @@ from acwm_core.evaluation.clips import (
     Clip,
     Predictor,
     donor_actions,
+    draw_seeds,
     read_clips,
 )
 from acwm_core.evaluation.config import EvaluationConfig
+from acwm_core.evaluation.draws import metrics_for, score_draws
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.results import Score
 from acwm_core.evaluation.score import (
@@ -62,6 +64,8 @@ class VideoModel(Protocol):
     def clip_frames(self) -> int: ...  # noqa: D102
     @property
     def steps(self) -> int | None: ...  # noqa: D102
+    @property
+    def samples(self) -> bool: ...  # noqa: D102
     @property
     def device(self) -> torch.device: ...  # noqa: D102
     @property
@@ -114,6 +118,13 @@ class Evaluator:
         return tuple(each for each in self.rows if reads or each != "truth")
 
     @property
+    def draws(self) -> int:
+        """How many draws of a clip are predicted, to be scored together; 0 if one is enough."""
+        if self.config.samples == 1:
+            return 0
+        return self.config.samples if self.world_model.samples else 1
+
+    @property
     def given(self) -> int:
         """How many context frames of a clip the model is given."""
         return self.config.context_frames or self.world_model.context_frames
@@ -138,6 +149,7 @@ class Evaluator:
         truths: Sequence[Prediction],
         kinds: Sequence[Predictor],
         donated: Sequence[NDArray[np.float32]] = (),
+        draws: int = 0,
     ) -> list[Prediction]:
         """Predict clips of one length, in one batch; all `kinds` of the first clip come first.
 
@@ -145,22 +157,26 @@ class Evaluator:
             truths: the true clips; the model is given their context frames and actions.
             kinds: what predicts them, of `PREDICTORS`.
             donated: another episode's actions for each clip, for ``shuffled``.
+            draws: how many `Prediction.draws` the model makes of each clip; 0 for none.
         """
-        given, seeds = truths[0].clip.given, [truth.clip.seed for truth in truths]
+        given, number = truths[0].clip.given, max(draws, 1)
+        drawn = [draw_seeds(truth.clip.seed, number) for truth in truths]
+        seeds = [own[draw] for draw in range(number) for own in drawn]
         true = torch.stack([truth.target for truth in truths]).to(self.device)
 
         def rollout(actions: Sequence[NDArray[np.float32]]) -> Video:
+            first, times = true[:, :given], len(actions) // len(truths)
             chunks = self.world_model.rollout_chunks(
-                true[:, :given],
+                torch.cat([first] * times) if times > 1 else first,
                 torch.as_tensor(np.stack(actions), device=self.device),
                 mode=self.config.mode,
                 steps=self.config.steps,
-                seeds=seeds,
+                seeds=seeds[: len(actions)],
             )
             return torch.cat([*chunks], 1)
 
         makers: dict[Predictor, Callable[[], Video]] = {
-            "model": lambda: rollout([truth.actions for truth in truths]),
+            "model": lambda: rollout([truth.actions for truth in truths] * number),
             "shuffled": lambda: rollout(donated),
             "copy": lambda: true[:, given - 1, None].expand_as(true),
             "codec": lambda: self.world_model.codec(true),
@@ -169,16 +185,23 @@ class Evaluator:
         with torch.inference_mode(), torch.autocast(self.device.type, enabled=False):
             videos = {kind: makers[kind]().float().cpu() for kind in kinds}
         return [
-            replace(truth, video=videos[kind][place], kind=kind)
+            _prediction(truth, kind, videos[kind][place :: len(truths)], several=draws > 0)
             for place, truth in enumerate(truths)
             for kind in predictors_for(truth.clip, kinds)
         ]
 
     def predictions(
-        self, clips: Iterable[Clip], episodes: EpisodeDataset, kinds: Sequence[Predictor]
+        self,
+        clips: Iterable[Clip],
+        episodes: EpisodeDataset,
+        kinds: Sequence[Predictor],
+        draws: int = 0,
     ) -> Iterator[list[Prediction]]:
-        """Predict clips batch by batch: successive clips of equal length together."""
-        size = self.config.batch_size
+        """Predict clips batch by batch: successive clips of equal length together.
+
+        A batch has fewer clips where several are drawn of each, so that it takes no more memory.
+        """
+        size = max(1, self.config.batch_size // max(draws, 1))
         for _, alike in itertools.groupby(
             self.truths(clips, episodes), lambda truth: len(truth.target)
         ):
@@ -191,7 +214,7 @@ class Evaluator:
                     else []
                 )
                 with noting(first.where + until * (last != first), *self.world_model.children()):
-                    made = self.predict(truths, kinds, donated)
+                    made = self.predict(truths, kinds, donated, draws)
                 yield made
 
     def scores(
@@ -203,10 +226,16 @@ class Evaluator:
         """Score all rows, or only those of `kinds`, of all clips of a split, clip by clip."""
         scores: list[Score] = []
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # NumPy releases the GIL
-            for made in self.predictions(clips, episodes, kinds or self.predictors):
-                scores += pool.map(score, made, itertools.repeat(self.metrics))
+            for made in self.predictions(clips, episodes, kinds or self.predictors, self.draws):
+                for rows in pool.map(self._rows, made):
+                    scores += rows
                 self.advance(len(made))
         return scores
+
+    def _rows(self, made: Prediction) -> list[Score]:
+        if made.draws:
+            return score_draws(made.draws, self.metrics)
+        return [score(made, self.metrics)]
 
     def sweep(self, clips: Sequence[Clip], episodes: EpisodeDataset) -> dict[int, list[Score]]:
         """Score the model on the first clip of each of the first episodes, per `steps_sweep` entry.
@@ -214,8 +243,9 @@ class Evaluator:
         Metrics that read states from video are left out (unless one is the headline), since reading
         them would take longer than predicting the clips.
         """
-        quick = replace(self, metrics=quick_metrics(self.metrics, self.card))
-        settings = {steps: replace(self.config, steps=steps) for steps in self.steps_sweep}
+        metrics = metrics_for(quick_metrics(self.metrics, self.card), samples=1)
+        quick = replace(self, metrics=metrics)
+        settings = {s: replace(self.config, steps=s, samples=1) for s in self.steps_sweep}
         return {
             steps: replace(quick, config=config).scores(self._swept(clips), episodes, ["model"])
             for steps, config in settings.items()
@@ -257,3 +287,11 @@ class Evaluator:
     def _swept(self, clips: Sequence[Clip]) -> list[Clip]:
         first = {clip.episode: clip for clip in reversed(clips)}
         return [first[episode] for episode in sorted(first)[: self.config.sweep_episodes]]
+
+
+def _prediction(truth: Prediction, kind: Predictor, videos: Video, *, several: bool) -> Prediction:
+    """What a row predicts of a clip; `videos` `[N, T, 3, H, W]` has its draws if there are any."""
+    made = replace(truth, video=videos[0], kind=kind)
+    if kind != "model" or not several:
+        return made
+    return replace(made, draws=tuple(replace(made, video=video) for video in videos))

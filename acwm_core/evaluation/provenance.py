@@ -55,6 +55,7 @@ def provenance(
         **predictor,
         "codec_fingerprint": evaluator.world_model.codec.fingerprint(),
         "evaluation": asdict(evaluator.config),
+        "draws": evaluator.draws or 1,
         "context_frames": evaluator.given,
         "dataset": {
             "path": str(dataset.path),

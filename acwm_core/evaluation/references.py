@@ -16,7 +16,7 @@ import acwm_core
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
-from acwm_core.evaluation.clips import Clip, Predictor
+from acwm_core.evaluation.clips import DRAWN, Clip, Predictor
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Score
 from acwm_core.evaluation.score import measure_facts
@@ -40,15 +40,16 @@ def scores_with_references(
     found: list[Score] = []
     with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
         found = load_scores(file) if file else []
-    kinds: list[Predictor] = [k for k in evaluator.predictors if not found or k not in KEPT]
-    made = evaluator.scores(clips, episodes, kinds)
+    asked: list[Predictor] = [k for k in evaluator.predictors if not found or k not in KEPT]
+    made = evaluator.scores(clips, episodes, asked)
     evaluator.advance(len(found))
     if file and not found:
         with contextlib.suppress(OSError, DataError):  # e.g. a read-only dataset
             file.parent.mkdir(exist_ok=True)
             write_scores(file, [score for score in made if score.kind in KEPT])
     rows = {(row.episode, row.start, row.kind): row for row in [*found, *made]}
-    places = [(c.episode, c.start, kind) for c in clips for kind in evaluator.predictors]
+    kinds = dict.fromkeys(("model", *DRAWN, *evaluator.predictors))
+    places = [(c.episode, c.start, kind) for c in clips for kind in kinds]
     return [rows[place] for place in places if place in rows]
 
 

@@ -12,7 +12,7 @@ import torch
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import StateEstimator
 from acwm_core.errors import PluginError, RecipeError, ShapeError, check_shape, noting
-from acwm_core.evaluation.clips import Clip, Predictor
+from acwm_core.evaluation.clips import DRAWN, Clip, Predictor
 from acwm_core.evaluation.metric import Metric, Prediction, SetMetric
 from acwm_core.evaluation.results import Score
 from acwm_core.evaluation.views import metric_and_view, parts_of
@@ -89,7 +89,7 @@ def needs_estimator(metric: Metric, card: EnvironmentCard) -> bool:
 
 def headline_of(metrics: Mapping[str, Metric]) -> str:
     """The metric that ranks clips and heads the report: the one of lowest rank, else the first."""
-    ranking = [name for name, metric in metrics.items() if not isinstance(metric, SetMetric)]
+    ranking = [n for n, m in metrics.items() if not (isinstance(m, SetMetric) or m.of_draws)]
     return min(ranking or metrics, key=lambda name: metrics[name].rank)
 
 
@@ -109,10 +109,13 @@ def measured_in(
 ) -> dict[str, Metric]:
     """The metrics that are measured for a row of a clip; the others are undefined there.
 
+    A single draw of the model says nothing about its draws, and neither does their mean.
     For ``truth``, metrics that compare pixels say nothing. For ``shuffled``, no states are read:
     this takes longer than the prediction, and the simulator says what other actions should do.
     For ``codec``, they are read where a noise floor is measured.
     """
+    if predictor in ("model", *DRAWN):
+        return {name: metric for name, metric in metrics.items() if not metric.of_draws}
     if predictor == "truth":
         return {name: m for name, m in metrics.items() if needs_estimator(m, card)}
     if predictor == "shuffled" or (predictor == "codec" and not clip.noise_floor):
@@ -127,7 +130,9 @@ def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
     frames. A prediction that is not finite gets the worst score in all metrics.
     """
     clip = prediction.clip
-    measured = measured_in(prediction.kind, clip, metrics, prediction.card)
+    measured = metrics
+    if not prediction.draws:
+        measured = measured_in(prediction.kind, clip, metrics, prediction.card)
     shown = prediction.without(clip.given - 1)
     frames = len(shown.target)
     scored = Score(

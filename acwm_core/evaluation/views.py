@@ -65,6 +65,7 @@ def parts_of(prediction: Prediction) -> dict[str, Prediction]:
             target=prediction.target[..., columns],
             masks=prediction.masks[..., columns],
             card=own,
+            draws=tuple(parts_of(draw)[view] for draw in prediction.draws),
         )
     return parts
 

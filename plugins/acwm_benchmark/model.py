@@ -25,7 +25,7 @@ class HandedIn:
     A clip is found by the seed of its noise, which stands for its start, and by its actions.
     """
 
-    steps = None
+    steps, samples = None, False
     device = torch.device("cpu")
 
     def __init__(self, tasks: Tasks, predictions: Predictions) -> None:

@@ -44,6 +44,18 @@ PHYSICS = {
 }
 """Metrics that read the video with an estimator: target and summary by name."""
 
+DRAWS = {
+    "energy_score": ("draws:EnergyScore", "distance of draws to the truth, less to each other"),
+    "spread_skill": (
+        "draws:SpreadSkill",
+        "spread of draws over error of their mean; 1 is right",
+    ),
+    "coverage_50": ("draws:Coverage50", "share of positions in the 50 % interval of draws"),
+    "coverage_80": ("draws:Coverage80", "share of positions in the 80 % interval of draws"),
+    "coverage_95": ("draws:Coverage95", "share of positions in the 95 % interval of draws"),
+}
+"""Metrics that judge several draws of a clip together: target and summary by name."""
+
 PERCEPTUAL = {
     "lpips": ("lpips:LPIPS", "learned perceptual distance; needs weights"),
     "fvd": ("fvd:FVD", "Fréchet distance of sets of videos; needs weights"),
@@ -58,6 +70,7 @@ LIBRARIES = {
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
-    """Register metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), and metrics of physics."""
-    for name, (target, summary) in (PIXELS | PHYSICS | PERCEPTUAL | LIBRARIES).items():
+    """Register metrics of pixels, as in ACWM-Phys (arXiv 2605.08567), of physics and of draws."""
+    known = PIXELS | PHYSICS | DRAWS | PERCEPTUAL | LIBRARIES
+    for name, (target, summary) in known.items():
         registry.add(name, f"acwm_metrics.{target}", summary=summary)

@@ -101,7 +101,8 @@ def compare_runs(
     applied to all p-values together.
 
     Args:
-        metrics: metrics to compare; by default all that the runs share.
+        metrics: metrics to compare; by default all that the runs share. Those with one right
+            score, which both may miss on either side, are not compared.
         splits: splits to compare; by default all that the runs share.
 
     Raises:
@@ -114,7 +115,7 @@ def compare_runs(
     summaries = dict(zip(run_labels(folders), map(Summary.read, folders), strict=True))
     warnings = _comparability(summaries)
     first = next(iter(summaries.values()))
-    names = _shared("metric", metrics, [list(each.metrics) for each in summaries.values()])
+    names = _shared("metric", metrics, [_compared(each) for each in summaries.values()])
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
     rows = dict(zip(summaries, map(_model_rows, folders), strict=True))
     metrics_of = {name: first.metrics[name] for name in names}
@@ -146,6 +147,10 @@ def compare_runs(
             for use in uses_of(label, folder, summary)
         ],
     )
+
+
+def _compared(summary: Summary) -> list[str]:
+    return [name for name, info in summary.metrics.items() if info.right is None]
 
 
 def _differences(

@@ -12,6 +12,7 @@ from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.files import inside
 from acwm_planning.jobs import PLANS
 from acwm_report.comparison import checksums
+from acwm_report.draws import draws_phrase
 from acwm_report.page import write_page
 from acwm_report.run import DAMAGE, described
 from acwm_report.scores import (
@@ -163,7 +164,9 @@ def _table(entries: Mapping[str, Summary], name: str) -> Table:
 
 
 def _remarks(summary: Summary, metrics: Iterable[str]) -> list[str]:
-    return [*failures(summary), *scored_shares(summary, metrics)]
+    drawn = {split: draws_phrase(summary, split) for split in summary.splits}
+    found = [f"{split_title(split)}: {phrase}" for split, phrase in drawn.items() if phrase]
+    return [*failures(summary), *scored_shares(summary, metrics), *found]
 
 
 def _facts(summary: Summary) -> list[Cell]:

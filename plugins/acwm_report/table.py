@@ -91,7 +91,7 @@ class Column:
 
     title: str  # as displayed
     unit: str = ""  # unit of the displayed numbers, or empty
-    better: str = ""  # direction that is better: ``"↑"``, ``"↓"`` or empty
+    better: str = ""  # what is better: ``"↑"``, ``"↓"``, ``"→ 1"`` for one right value, or empty
     group: str = ""  # common heading of a group of columns
     # the column's name in CSV, where numbers have the metric's own unit; the title by default
     key: str = ""
@@ -99,7 +99,9 @@ class Column:
     @classmethod
     def of(cls, info: MetricInfo, scale: Scale, key: str, group: str = "") -> Column:
         """The head of a column of scores."""
-        return cls(info.title, scale.unit, "↑" if info.higher_is_better else "↓", group, key)
+        better = "↑" if info.higher_is_better else "↓"
+        better = better if info.right is None else f"→ {info.right:g}"
+        return cls(info.title, scale.unit, better, group, key)
 
 
 @dataclass(frozen=True)

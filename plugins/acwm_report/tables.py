@@ -19,6 +19,7 @@ from acwm_core.evaluation.shares import error_shares
 from acwm_core.evaluation.views import metric_and_view, of_view
 from acwm_report.charts import counterfactuals
 from acwm_report.comparison import compare_runs
+from acwm_report.draws import draws_phrase
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale, Table
 from acwm_report.titles import BESIDE, ROWS, branch_title, clips_title, label_title, split_title
@@ -42,6 +43,8 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
         rows = [row for view in views for row in _score_rows(run, split, scales, view)]
         title, parts = _title(split, result), error_shares(result.scores)
         about = f"Roughly, {parts}." if parts else ""
+        drawn = draws_phrase(run.summary, split)
+        about = " ".join(filter(None, (about, f"{drawn[:1].upper()}{drawn[1:]}." if drawn else "")))
         tables.append(Table(title, columns, rows, "Prediction", about, f"scores-{split}"))
     return tables
 
@@ -80,6 +83,7 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
         for name in run.metrics("states"):
             info, scale = run.summary.metrics[name], run.scale(name)
             way = "higher is better" if info.higher_is_better else "lower is better"
+            way = way if info.right is None else f"{info.right:g} is right"
             if any(_defined(scores[kind], [name]) for kind in kinds):
                 cells = [Cell.of(scores[kind].get(name), scale) for kind in kinds]
                 if shares:

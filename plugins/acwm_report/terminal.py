@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.tables import plain_table
+from acwm_report.draws import draws_phrase
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 ROWS = {
     "model": "model",
+    "mean_of_draws": "mean frames",
+    "best_of_draws": "best draw",
     "shuffled": "other actions",
     "copy": "first frame",
     "codec": "codec alone",
@@ -42,12 +45,12 @@ def print_summary(summary: Summary) -> None:
     """Print the scores of every split, the steps curve, and published scores for comparison."""
     from rich.console import Console
 
-    from acwm_report.terminal import about_published
-
     console = Console(highlight=False, markup=False)
     for split, result in summary.splits.items():
         console.print(_split_table(summary, split))
         _print_remarks(result.scores)
+        if phrase := draws_phrase(summary, split):
+            click.echo(f"{split}: {phrase}")
     click.echo(
         "± is half the 95 % confidence interval over episodes; `other actions`: the model was "
         "given another episode's actions"

@@ -17,6 +17,8 @@ ROWS = {
     "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
     "perturbed": ("Simulator, perturbed", "started a millimetre off; few clips"),
     "model": ("Model, true actions", "what is being evaluated"),
+    "mean_of_draws": ("Model, mean of its draws", "the mean frames; what is unsure is a haze"),
+    "best_of_draws": ("Model, best of its draws", "in each metric the best draw of each clip"),
     "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
     "copy": ("First frame, copied", "a prediction in which nothing moves"),
 }
@@ -25,6 +27,8 @@ ROWS = {
 
 BESIDE = {
     "model": "Model",
+    "mean_of_draws": "Mean of draws",
+    "best_of_draws": "Best of draws",
     "truth": "Noise floor",
     "codec": "Codec",
     "perturbed": "Perturbed",

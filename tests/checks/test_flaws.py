@@ -24,7 +24,11 @@ MODULES = (
     test_objectives,
     test_planners,
 )
-SUITES = [*(module.FLAWS for module in MODULES), test_metrics.SET_FLAWS]
+SUITES = [
+    *(module.FLAWS for module in MODULES),
+    test_metrics.SET_FLAWS,
+    test_metrics.DRAWS_FLAWS,
+]
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from acwm_core.checks import check_metric
-from acwm_core.checks.metric import ClipMetricChecks, SetMetricChecks
+from acwm_core.checks.metric import ClipMetricChecks, DrawsMetricChecks, SetMetricChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.evaluation.metric import Metric, SetMetric
 from tests.checks.results import Flaws, failures, installed
 
-FLAWS, SET_FLAWS = (
-    Flaws(check_metric, checks_of(suite)) for suite in (ClipMetricChecks, SetMetricChecks)
+FLAWS, SET_FLAWS, DRAWS_FLAWS = (
+    Flaws(check_metric, checks_of(suite))
+    for suite in (ClipMetricChecks, SetMetricChecks, DrawsMetricChecks)
 )
 
 
@@ -146,3 +147,52 @@ class Inverse(Change):
 class RandomSet(Change):
     def features(self, prediction):
         return super().features(prediction) + 1e-9 * np.random.default_rng().random()
+
+
+class Apart(Metric):
+    """How far the draws are from their mean."""
+
+    name = "apart"
+    of_draws = True
+
+    def per_frame(self, prediction):
+        videos = np.stack([draw.video.numpy() for draw in prediction.draws])
+        return videos.std(0).mean((1, 2, 3), dtype=np.float64)
+
+
+def test_a_sound_metric_of_draws_passes():
+    assert failures(check_metric(Apart)) == {}
+
+
+@DRAWS_FLAWS.caught_by("draws have no order", "the order of the draws matters")
+class WeighsDraws(Apart):
+    def per_frame(self, prediction):
+        return super().per_frame(prediction) + prediction.draws[0].video.mean((1, 2, 3)).numpy()
+
+
+@DRAWS_FLAWS.caught_by("draws have no order", "one draw only")
+class ForgetsDraws(Distance):
+    of_draws = True
+
+
+@DRAWS_FLAWS.caught_by("says what it is", "empty")
+class NamelessOfDraws(Apart):
+    name = ""
+
+
+@DRAWS_FLAWS.caught_by("scores a clip", "scores")
+class ForgetsAFrame(Apart):
+    def per_frame(self, prediction):
+        return super().per_frame(prediction)[1:]
+
+
+@DRAWS_FLAWS.caught_by("scoring repeats and leaves no trace", "second scoring")
+class RandomOfDraws(Apart):
+    def per_frame(self, prediction):
+        return super().per_frame(prediction) + np.random.default_rng().random()
+
+
+@DRAWS_FLAWS.caught_by("summary of equals is their value", "three times")
+class SumsOfDraws(Apart):
+    def summarise(self, values, weights=None):
+        return float(np.sum(values))
