@@ -71,13 +71,13 @@ clean:  ## Remove what the other targets made, but neither data/ nor runs/
 
 # pip is written last, so an interrupted creation is begun anew.
 $(BIN)/pip:
-	@for python in "$(PYTHON)" python3.11 python3; do \
-	  if "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	@for python in "$(PYTHON)" python3.11 python3.12 python3.13 python3; do \
+	  if "$$python" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; then \
 	    echo "creating $(VENV) with $$("$$python" --version)"; \
 	    exec "$$python" -m venv $(VENV); \
 	  fi; \
 	done; \
-	echo "acwm needs Python 3.11: install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 2
+	echo "acwm needs Python 3.11, 3.12 or 3.13: install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 2
 
 # Taichi, which renders, links to libX11 even where there is no screen.
 $(VENV)/checked: $(BIN)/pip

@@ -119,6 +119,7 @@ class Component:
         summary: one phrase for `acwm list`.
         extra: the extra of the plugin's distribution that installs its dependencies, if any.
         requires: modules that the extra installs, to check without importing if they are there.
+        install: what to do instead if the extra cannot install them, e.g. on this Python.
         defaults: parameters preset by this name, e.g. a model size; recipes may override them.
         physics: for an environment, ``"package.module:function"`` of its physics, see
             `acwm_core.env.physics.Physics`; the module imports no simulator.
@@ -139,6 +140,7 @@ class Component:
     physics: str | None = None
     tasks: Mapping[str, str] = field(default_factory=dict[str, str])
     objective: str | None = None
+    install: str = ""
 
     @property
     def part(self) -> str:
@@ -210,6 +212,8 @@ class Component:
 
     def install_command(self, module: str) -> str:
         """The command that installs `module`, by the plugin's extra if it names one."""
+        if self.install:
+            return self.install
         if self.extra and self.distribution:
             module = f"{self.distribution}[{self.extra}]"
         return f"pip install '{module}'"
@@ -246,6 +250,7 @@ class Registry:
         physics: str | None = None,
         tasks: Mapping[str, str] | None = None,
         objective: str | None = None,
+        install: str = "",
         **defaults: Any,
     ) -> None:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
@@ -259,6 +264,7 @@ class Registry:
             physics: for an environment, the target of its physics, for estimators.
             tasks: for an environment, the targets of its tasks, by name.
             objective: for a model, the objective that it learns by, if it has one of its own.
+            install: what to do if the extra cannot install these modules, e.g. on this Python.
             **defaults: parameters that this name presets.
 
         Raises:
@@ -275,7 +281,7 @@ class Registry:
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
         self._components[name] = Component(
             *(self.kind, name, target, self._plugin, self._distribution, summary, extra, requires),
-            *(defaults, physics, dict(tasks or {}), objective),
+            *(defaults, physics, dict(tasks or {}), objective, install),
         )
 
     def include(self, component: Component) -> None:

@@ -72,8 +72,8 @@ def findings() -> Iterator[Finding]:
     from acwm_core.executors import available_cores
     from acwm_core.plugins import catalog
 
-    works = sys.version_info[:2] == (3, 11)
-    advice = "" if works else "; the simulators ship wheels for Python 3.11 alone"
+    works = (3, 11) <= sys.version_info < (3, 14)
+    advice = "" if works else "; the simulators ship wheels for Python 3.11, 3.12 and 3.13 alone"
     yield Finding("Python", works, f"{platform.python_version()}{advice}")
     yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
     yield from map(_package, PACKAGES)

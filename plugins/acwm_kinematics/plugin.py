@@ -1,8 +1,7 @@
 """Register the environments of this package. Does not import a simulator."""
 
 from acwm_core.plugins import Registry, hookimpl
-
-_NEEDS = {"extra": "kinematics", "requires": ("mujoco", "pybullet", "taichi")}
+from acwm_sim.needs import BULLET
 
 
 @hookimpl
@@ -13,9 +12,8 @@ def register_environments(registry: Registry) -> None:
         "acwm_kinematics.robot_arm:RobotArm",
         physics="acwm_kinematics.physics:ROBOT_ARM",
         tasks={"reach": "acwm_kinematics.arm_task:REACH"},
-        extra="kinematics",
-        requires=("pybullet", "taichi"),
         summary="a Franka Panda goes from goal to goal around posts by joint turns (PyBullet)",
+        **BULLET,
     )
     registry.add(
         "reacher",

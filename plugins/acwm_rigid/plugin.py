@@ -1,6 +1,7 @@
 """Register the environments of this package. Does not import a simulator."""
 
 from acwm_core.plugins import Registry, hookimpl
+from acwm_sim.needs import BULLET
 
 _NEEDS = {"extra": "rigid", "requires": ("mujoco", "taichi")}
 _PUSHING = {
@@ -42,6 +43,5 @@ def register_environments(registry: Registry) -> None:
         physics="acwm_rigid.physics:STACK_CUBE",
         tasks={"stack": "acwm_rigid.stack_task:STACK"},
         summary="a Franka Panda puts a red cube onto a green one (PyBullet)",
-        extra="rigid",
-        requires=("pybullet", "taichi"),
+        **BULLET,
     )

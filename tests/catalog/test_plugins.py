@@ -89,6 +89,21 @@ def test_one_whose_extra_is_missing(install: Install, tmp_path: Path) -> None:
         component.load()
 
 
+def test_one_whose_extra_cannot_install_what_it_needs(install: Install) -> None:
+    install(
+        "plugin_extra",
+        """
+        @hookimpl
+        def register_environments(registry):
+            needs = {"extra": "sim", "requires": ("no_such_engine",), "install": "build an engine"}
+            registry.add("needy", "plugin_extra_heavy:Needy", **needs)
+        """,
+    )
+    assert loaded().component("environment", "needy").needs == (
+        "needs no_such_engine: build an engine"
+    )
+
+
 def test_a_missing_module_of_its_own_is_told(install: Install) -> None:
     install(
         "plugin_bug",
