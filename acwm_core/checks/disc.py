@@ -21,6 +21,7 @@ from acwm_core.env.physics import (
     StateEstimator,
     States,
 )
+from acwm_core.env.symmetry import Symmetry, group, permuted
 from acwm_core.errors import ShapeError
 from acwm_core.model.shapes import Clip
 
@@ -51,6 +52,10 @@ class Disc(Environment):
         ),
         instances=("background", "disc"),
         engine="numpy",
+        symmetries=group(
+            Symmetry((-1, 2), mirrored=True, states={"position": (-1, 2)}),
+            Symmetry((2, -1), quarter_turns=1, states={"position": (2, -1)}),  # y is down
+        ),
     )
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
@@ -59,6 +64,9 @@ class Disc(Environment):
 
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         self.position = self.position + amount * rng.normal(0, 1e-3, 2)
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        self.position = permuted(self.position, symmetry.states["position"])
 
     def _snapshot(self) -> Callable[[], None]:
         position = self.position.copy()

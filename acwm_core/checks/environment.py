@@ -21,12 +21,19 @@ from acwm_core.checks.trial import BEGINNING
 from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment, EnvironmentCard, Policy
 from acwm_core.env.episode import Episode, EpisodeSpec, Factor
+from acwm_core.env.symmetry import Symmetry, group, permuted
 
 CLOSE = 0.01
 """Mean difference of two frames, as a fraction of white, that counts as hardly visible."""
 
 SOME = BEGINNING // 2
 """Frames that are simulated once more to show that nothing but spec and actions counts."""
+
+OVERLAP, PAINT, OFF = 0.5, 0.1, 0.02
+"""What a symmetry must keep: the least overlap of the masks of every instance (intersection over
+union; edges of small ones fall into other pixels), the largest mean difference of its colours as a
+fraction of white (light and floor need not follow), and the largest error of a declared field of
+the state as a fraction of its largest value."""
 
 
 class EnvironmentChecks(TaskChecks):
@@ -177,6 +184,42 @@ class EnvironmentChecks(TaskChecks):
         expect(first < CLOSE, f"a perturbed start is seen: it differs by {first:.1%} on average")
         what = f"without any action the picture differs by {last:.2%} soon, {first:.2%} at first"
         expect(last < 3 * first + CLOSE / 4, f"a perturbed start is not at rest: {what}")
+
+    def symmetries_hold(self) -> None:
+        """Lead from a transformed start, by transformed actions, to the transformed video."""
+        card = self.card
+        if not card.symmetries:
+            raise NotTried("its card declares no symmetries")
+        whole = {each.name for each in group(*card.symmetries)}
+        found = {each.name for each in card.symmetries}
+        lacking = ", ".join(sorted(whole - found))
+        expect(found == whole, f"the symmetries are no group: {lacking} follows from them")
+        for symmetry in card.symmetries:
+            actions = symmetry.of_actions(self.beginning.actions)
+            turned = simulate(
+                self.environment, self.spec(), actions, frames=BEGINNING, symmetry=symmetry
+            )
+            broken = self._breach(symmetry, self.beginning, turned)
+            expect(not broken, f"{symmetry.name!r} is no symmetry: {broken}")
+
+    def _breach(self, symmetry: Symmetry, usual: Episode, turned: Episode) -> str:
+        """What of `turned` is not as in the `usual` episode after `symmetry`; empty if nothing."""
+        for name, axes in symmetry.states.items():
+            wanted = permuted(np.asarray(usual.states[name], np.float64), axes)
+            error = np.abs(turned.states[name] - wanted).max()
+            if error > OFF * np.abs(wanted).max() + 1e-6:
+                return f"state {name!r} differs by {error:.2g}"
+        masks = symmetry.of_frames(usual.masks)
+        colours = symmetry.of_frames(np.moveaxis(usual.video, -1, 1))
+        differs = np.abs(colours.astype(float) - np.moveaxis(turned.video, -1, 1)).mean(1) / 255
+        for number, name in enumerate(self.card.instances):
+            here, there = masks == number, turned.masks == number
+            both, either = here & there, here | there
+            if either.any() and both.sum() < OVERLAP * either.sum():
+                return f"masks of {name!r} overlap by {both.sum() / either.sum():.0%}"
+            if both.any() and differs[both].mean() > PAINT:
+                return f"the colour of {name!r} differs by {differs[both].mean():.0%}"
+        return ""
 
     def factors_matter(self) -> None:
         """Change the episode when a factor is shifted (one of four episodes is enough)."""

@@ -196,4 +196,5 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     values = card.to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
+    values["environment"].pop("symmetries", None)  # they say what could be made of the bytes
     return dict(flat_items(values))

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from acwm_core.data.dataset import EpisodeDataset
+    from acwm_core.env.symmetry import Symmetry
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class DataConfig:
             same, and a larger fraction contains all episodes of a smaller one.
         validation_episodes: episodes held out from the end of `train` for the validation loss; a
             tenth by default, at most 32.
+        symmetries: train on each clip also as the symmetries on the card of the data transform it:
+            push_cube, which has seven, gives eight times as many clips. Validation does not.
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
             latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
@@ -58,6 +61,7 @@ class DataConfig:
     window_stride: int = 4
     fraction: float = 1.0
     validation_episodes: int | None = None
+    symmetries: bool = False
     cache_latents: bool = True
     workers: int = 0
     reader: Literal["random_access", "webdataset"] = "random_access"
@@ -211,10 +215,12 @@ class Clips(ABC):
         given: context frames of a clip; every clip has at least one latent frame more to predict.
         per_length: how many clips should share a length, as those of a batch do; see
             `shared_lengths`.
+        symmetries: of the environment; each window gives one more clip by each of them.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
         lengths: number of video frames of each clip; see `clip_lengths` and `shared_lengths`.
+        versions: those of every window, in turn: as recorded (None), and by each symmetry.
     """
 
     def __init__(
@@ -227,9 +233,12 @@ class Clips(ABC):
         temporal_stride: int | None = None,
         given: int = 1,
         per_length: int = 1,
+        symmetries: Sequence[Symmetry] = (),
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
-        self.windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.versions: tuple[Symmetry | None, ...] = (None, *symmetries)
+        windows = list_windows(episodes.lengths, frames, stride, indices)
+        self.windows = windows.repeat(len(self.versions), axis=0)
         self.lengths = clip_lengths(
             self.windows, episodes.lengths, frames, temporal_stride, given, per_length
         )
@@ -237,6 +246,10 @@ class Clips(ABC):
 
     def __len__(self) -> int:
         return len(self.windows)
+
+    def version(self, index: int) -> Symmetry | None:
+        """The symmetry by which a clip is transformed; None if it is as recorded."""
+        return self.versions[index % len(self.versions)]
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """One clip: the arrays of `batch` without the batch axis."""
@@ -265,6 +278,9 @@ class ClipDataset(Clips):
         for row, (episode, start) in enumerate(windows):
             self.episodes.video_into(video[row], episode, start)
             actions[row] = window_actions(self._actions_of(episode), start, frames)
+            if symmetry := self.version(indices[row]):
+                video[row] = symmetry.of_frames(video[row]).copy()
+                actions[row] = symmetry.of_actions(actions[row])
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
 
     def _actions_of(self, episode: int) -> NDArray[np.float32]:

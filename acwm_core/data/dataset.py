@@ -19,6 +19,7 @@ from acwm_core.data.remote import data_folder, fetch_shard, origin
 from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, open_shard
 from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError
 from acwm_core.files import written_whole
 
@@ -229,6 +230,22 @@ class EpisodeDataset:
             record = self._records[number]
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record.sha256)
         return path
+
+
+def declared_symmetries(episodes: EpisodeDataset) -> tuple[Symmetry, ...]:
+    """The symmetries on the card of a dataset.
+
+    Raises:
+        DataError: there are none.
+    """
+    card = episodes.card.environment
+    if not card.symmetries:
+        raise DataError(
+            f"the card of {episodes.path} declares no symmetries of {card.name}: train without "
+            "data.symmetries; if its environment has some by now, the command that made the data "
+            "adds them to the card"
+        )
+    return card.symmetries
 
 
 def window_into(target: NDArray[np.uint8], data: bytes, start: int, length: int) -> None:

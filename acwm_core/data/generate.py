@@ -221,7 +221,10 @@ def fill(
             remove_partial(out / split)
         manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
         tasks = list(_missing_shards(out, wanted, source, manifests))
-        joined = replace(there, splits=_in_order({**there.splits, **wanted.splits}))
+        splits = _in_order({**there.splits, **wanted.splits})
+        symmetries = wanted.environment.symmetries or there.environment.symmetries
+        environment = replace(there.environment, symmetries=symmetries)
+        joined = replace(there, environment=environment, splits=splits)
         if tasks:
             if differences:  # other versions matter only if shards are still to be made
                 raise other_dataset(out, differences)

@@ -1,8 +1,9 @@
 """Latents of clips: encoded once by a frozen codec, kept beside the clips, read at memory speed.
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
-float16 array ``[clips, L, C, h, w]`` per shard. A card in that folder repeats these facts, so that
-a renamed or copied folder is not misread.
+float16 array ``[clips, L, C, h, w]`` per shard. Latents of transformed clips are in a folder of
+their own, whose name ends with the symmetry's: to transform latents would not be exact. A card in
+each folder repeats these facts, so that a renamed or copied folder is not misread.
 
 Any number of processes encode a dataset together: each shard of latents has its own lock, because
 waiting in a collective operation would time out.
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from acwm_core.data.clips import Clips, common_length, padded_video, window_actions, window_starts
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError, noting
 from acwm_core.executors import Report, progress_bar
 from acwm_core.files import alone, parse_json, writing, written_whole
@@ -49,6 +51,7 @@ class LatentFolder:
     fingerprint: str  # of the codec, `Codec.fingerprint()`
     frames: int  # frames of a window
     stride: int  # frames between the starts of an episode's windows
+    symmetry: Symmetry | None = None  # transforms the windows before they are encoded
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"\w[\w.-]*", str(self.fingerprint)):
@@ -59,6 +62,7 @@ class LatentFolder:
         """The folder."""
         episodes = self.episodes
         windows = f"{episodes.split}-{self.frames}x{self.stride}-{episodes.checksum[:12]}"
+        windows += f"-{self.symmetry.name}" if self.symmetry else ""
         return episodes.path / LATENTS / str(self.fingerprint) / windows
 
     def file(self, number: int) -> Path:
@@ -88,6 +92,7 @@ class LatentFolder:
             "stride": self.stride,
             "data": episodes.checksum,
         }
+        card |= {"symmetry": self.symmetry.name} if self.symmetry else {}
         if not file.exists():
             with written_whole(file) as partial:
                 partial.write_text(json.dumps(card, indent=1), "utf-8")
@@ -109,6 +114,7 @@ def encode_windows(
     frames: int = 37,
     stride: int = 4,
     batch_size: int = 8,
+    symmetry: Symmetry | None = None,
     progress: bool = True,
 ) -> Path:
     """Encode every window of `episodes` that is not encoded yet.
@@ -121,6 +127,7 @@ def encode_windows(
         codec: frozen; used in evaluation mode, on the device of its parameters.
         stride: frames between the starts of an episode's windows; 4 gives eight windows of 37
             frames for an episode of 66.
+        symmetry: transforms the windows before they are encoded.
 
     Returns:
         The folder of the latents, which `LatentClipDataset` finds by the codec's fingerprint.
@@ -130,12 +137,13 @@ def encode_windows(
             codec; or the codec returned values that float16 cannot hold.
         ShapeError: the codec cannot encode frames of this size.
     """
-    folder = LatentFolder(episodes, codec.fingerprint(), frames, stride)
+    folder = LatentFolder(episodes, codec.fingerprint(), frames, stride, symmetry)
     with writing(folder.path), contextlib.ExitStack() as stack:
         folder.path.mkdir(parents=True, exist_ok=True)
         folder.keep_card()
         total = sum(episodes.shards[number][1] for number in folder.unfinished())
-        bar = progress_bar(f"encoding {episodes.split}", total, shown=progress)
+        what = f"encoding {episodes.split}" + (f" {symmetry.name}" if symmetry else "")
+        bar = progress_bar(what, total, shown=progress)
         report = stack.enter_context(bar)
         stack.callback(codec.train, codec.training)
         codec.eval()
@@ -168,6 +176,8 @@ def _encode_episode(
     frames, group, starts = folder.frames, codec.temporal_stride, folder.starts(index)
     device = next((p.device for p in codec.parameters()), torch.device("cpu"))
     pixels = padded_video(folder.episodes.video(index), frames)
+    if folder.symmetry:
+        pixels = folder.symmetry.of_frames(pixels).copy()
     video = torch.as_tensor(pixels).to(device).float() / 255
     fast = codec.encodes_in_bfloat16 and device.type == "cpu" and cpu_has_fast_bfloat16()
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=fast):
@@ -205,8 +215,8 @@ class LatentClipDataset(Clips):
         episodes: the split they come from.
         fingerprint: of the codec, `Codec.fingerprint()`.
         temporal_stride: as in `Clips`.
-        windows: `frames` and `stride`, as they were encoded, and `indices`, `given` and
-            `per_length`, as in `Clips`.
+        windows: `frames` and `stride`, as they were encoded, and `indices`, `given`, `per_length`
+            and `symmetries`, as in `Clips`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or a shard is damaged.
@@ -221,20 +231,16 @@ class LatentClipDataset(Clips):
         **windows: Any,
     ) -> None:
         super().__init__(episodes, temporal_stride=temporal_stride, **windows)
-        frames, stride = self.frames, self.stride
-        self._folder = LatentFolder(episodes, fingerprint, frames, stride)
-        if self._folder.unfinished():
-            others = sorted(path.name for path in (episodes.path / LATENTS).glob("*"))
-            known = f" (there are latents of {', '.join(others)})" if others else ""
-            raise DataError(
-                f"{episodes.split} of {episodes.path} is not encoded by the codec {fingerprint} in "
-                f"windows of {frames} frames every {stride}{known}: encode it with "
-                f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
-                f"--frames {frames} --stride {stride}`"
-            )
-        self._folder.keep_card()
+        self._folders = [
+            LatentFolder(episodes, fingerprint, self.frames, self.stride, symmetry)
+            for symmetry in self.versions
+        ]
+        for folder in self._folders:
+            if folder.unfinished():
+                raise _not_encoded(folder)
+            folder.keep_card()
         self._temporal_stride = temporal_stride or 1
-        counts = [len(self._folder.starts(index)) for index in range(len(episodes))]
+        counts = [len(self._folders[0].starts(index)) for index in range(len(episodes))]
         # For every episode: its shard, and the row of its first window in the shard's array.
         self._places = [
             (number, sum(counts[first:index]))
@@ -242,7 +248,7 @@ class LatentClipDataset(Clips):
             for index in range(first, first + count)
         ]
         self._rows = [sum(counts[first : first + count]) for first, count in episodes.shards]
-        self._layouts: dict[int, tuple[int, tuple[int, ...]]] = {}
+        self._layouts: dict[Path, tuple[int, tuple[int, ...]]] = {}
         for episode in map(int, np.unique(self.windows[:, 0])):
             self._actions[episode] = episodes.actions(episode)
 
@@ -257,22 +263,27 @@ class LatentClipDataset(Clips):
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
         latents, actions = list[NDArray[np.float16]](), list[NDArray[np.float32]]()
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
-        for episode, start in windows:
+        for index, (episode, start) in zip(indices, windows, strict=True):
+            folder = self._folders[index % len(self._folders)]
             shard, row = self._places[episode]
-            latents.append(self._read(shard, row + start // self.stride, kept))
-            actions.append(window_actions(self._actions[episode], start, frames))
+            latents.append(self._read(folder, shard, row + start // self.stride, kept))
+            taken = window_actions(self._actions[episode], start, frames)
+            symmetry = folder.symmetry
+            actions.append(symmetry.of_actions(taken) if symmetry else taken)
         return {
             "latents": torch.as_tensor(np.stack(latents)),
             "actions": torch.as_tensor(np.stack(actions)),
         }
 
-    def _read(self, shard: int, row: int, kept: int | None) -> NDArray[np.float16]:
+    def _read(
+        self, folder: LatentFolder, shard: int, row: int, kept: int | None
+    ) -> NDArray[np.float16]:
         """A window's latents, or the first `kept` of them, `[L, C, h, w]`.
 
         They are read, not memory-mapped: accessing the map of a truncated file would kill the
         process with SIGBUS.
         """
-        file = self._folder.file(shard)
+        file = folder.file(shard)
         try:
             offset, shape = self._layout(shard, file)
             latents = np.empty((kept or shape[0], *shape[1:]), np.float16)
@@ -288,9 +299,22 @@ class LatentClipDataset(Clips):
 
     def _layout(self, shard: int, file: Path) -> tuple[int, tuple[int, ...]]:
         """The byte offset of a shard's latents in its file, and the shape of one window's."""
-        if shard not in self._layouts:
+        if file not in self._layouts:
             latents = np.load(file, mmap_mode="r", allow_pickle=False)
             if latents.dtype != np.float16 or len(latents) != self._rows[shard]:
                 raise ValueError(f"they are {latents.dtype} {latents.shape}")
-            self._layouts[shard] = int(latents.offset), latents.shape[1:]
-        return self._layouts[shard]
+            self._layouts[file] = int(latents.offset), latents.shape[1:]
+        return self._layouts[file]
+
+
+def _not_encoded(folder: LatentFolder) -> DataError:
+    episodes, symmetry = folder.episodes, folder.symmetry
+    others = sorted(path.name for path in (episodes.path / LATENTS).glob("*"))
+    known = f" (there are latents of {', '.join(others)})" if others else ""
+    return DataError(
+        f"{episodes.split} of {episodes.path} is not encoded by the codec {folder.fingerprint} in "
+        f"windows of {folder.frames} frames every {folder.stride}"
+        f"{f', {symmetry.name}' if symmetry else ''}{known}: encode it with "
+        f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
+        f"--frames {folder.frames} --stride {folder.stride}{' --symmetries' if symmetry else ''}`"
+    )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from acwm_core.env.card import check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import PluginError, ShapeError, expect, noting
 from acwm_core.plugins import Component, catalog
 
@@ -49,6 +50,7 @@ def simulate(
     *,
     frames: int | None = None,
     perturbation: float = 0.0,
+    symmetry: Symmetry | None = None,
 ) -> Episode:
     """Run one episode of T frames and record everything about it.
 
@@ -59,6 +61,7 @@ def simulate(
             T-th row leads to no frame and is not used.
         frames: T; by default and at most ``card.horizon``.
         perturbation: how far to perturb the start state; see `Environment._perturb`.
+        symmetry: transforms the start state, but no actions; see `Environment._transform`.
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
@@ -67,7 +70,7 @@ def simulate(
             the card change.
         PluginError: the environment raised something else.
         RecipeError: the spec asks for a factor or value that the environment does not have, or
-            the environment has no perturbed start.
+            the environment has no perturbed or transformed start.
     """
     horizon = min(frames or environment.card.horizon, environment.card.horizon)
     if actions is not None and len(actions) not in (horizon, horizon - 1):
@@ -75,7 +78,8 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    options, card = {"spec": spec, "perturbation": perturbation}, environment.card
+    options = {"spec": spec, "perturbation": perturbation, "symmetry": symmetry}
+    card = environment.card
     taken = np.zeros((horizon, card.action.size), np.float32)
     video: list[NDArray[Any]] = []
     infos: list[dict[str, Any]] = []

@@ -25,6 +25,7 @@ from acwm_core.data.clips import ClipDataset, window_actions
 from acwm_core.data.dataset import window_into
 from acwm_core.data.loader import ClipSampler, epoch_order
 from acwm_core.data.shards import damaged_shard
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError
 
 default_collate = cast(Any, torch_data).default_collate  # it has no types
@@ -39,6 +40,7 @@ class _Window(NamedTuple):
     frames: int
     length: int  # frames of the episode
     where: tuple[Path, int]  # the shard, and the episode's position in it
+    symmetry: Symmetry | None  # that transforms the clip
 
 
 class ClipStream(torch_data.IterableDataset[Any]):
@@ -103,7 +105,8 @@ class ClipStream(torch_data.IterableDataset[Any]):
                     video = reader.read(place, "video.mkv")
                     for row in group:
                         start, frames = int(clips.windows[row, 1]), int(clips.lengths[row])
-                        yield _Window(video, actions, start, frames, length, where)
+                        version = clips.version(int(row))
+                        yield _Window(video, actions, start, frames, length, where, version)
 
     def _batches(self, windows: Iterable[_Window]) -> Iterator[dict[str, Tensor]]:
         """Batches of clips of one length; clips that do not fill a batch wait for the next pass."""
@@ -123,4 +126,6 @@ class ClipStream(torch_data.IterableDataset[Any]):
         except DataError as error:
             raise damaged_shard(path, f"video.mkv of episode {place}: {error}") from error
         actions = window_actions(window.actions, window.start, window.frames)
+        if symmetry := window.symmetry:
+            video, actions = symmetry.of_frames(video).copy(), symmetry.of_actions(actions)
         return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}

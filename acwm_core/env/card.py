@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.episode import Episode, Factor
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import ShapeError, expect
 
 ActionKind = Literal["absolute", "delta", "velocity", "torque"]
@@ -96,6 +97,11 @@ class EnvironmentCard:
         variants: other registered names that are variants of this environment.
         citation: source of the task.
         views: names of the cameras, from left to right, if a frame shows several of equal width.
+        symmetries: all that the environment has, see `acwm_core.env.symmetry.group`; without those
+            that frames of this size cannot show.
+
+    Raises:
+        ShapeError: a symmetry takes another number of actions.
     """
 
     name: str
@@ -113,9 +119,18 @@ class EnvironmentCard:
     variants: tuple[str, ...] = ()
     citation: str = ""
     views: tuple[str, ...] = ()
+    symmetries: tuple[Symmetry, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fps", plain_rate(self.fps))
+        for symmetry in self.symmetries:
+            if len(symmetry.actions) != self.action.size:
+                raise ShapeError(
+                    f"the symmetry {symmetry.name!r} of {self.name} takes "
+                    f"{len(symmetry.actions)} actions, not {self.action.size}"
+                )
+        kept = tuple(each for each in self.symmetries if each.keeps(self.frame_size))
+        object.__setattr__(self, "symmetries", kept)
 
     @property
     def view_names(self) -> tuple[str, ...]:
@@ -129,7 +144,8 @@ class EnvironmentCard:
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
         values = asdict(self)
-        return values if self.views else {k: v for k, v in values.items() if k != "views"}
+        newer = {name for name in ("views", "symmetries") if not values[name]}
+        return {name: value for name, value in values.items() if name not in newer}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
@@ -139,6 +155,8 @@ class EnvironmentCard:
         values["factors"] = tuple(Factor(**_fields(f)) for f in fields["factors"])
         values["state"] = tuple(StateField(**_fields(f)) for f in fields["state"])
         values["episodes"] = dict(fields.get("episodes", {}))
+        symmetries = fields.get("symmetries", ())
+        values["symmetries"] = tuple(map(Symmetry.from_dict, symmetries))
         return cls(**values)
 
 

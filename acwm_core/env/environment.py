@@ -20,6 +20,7 @@ from acwm_core.env.card import ActionSpec as ActionSpec
 from acwm_core.env.card import EnvironmentCard as EnvironmentCard
 from acwm_core.env.card import StateField as StateField
 from acwm_core.env.episode import EpisodeSpec, FactorValue, draw_factors, ood_label
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
@@ -100,6 +101,13 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         """
         raise RecipeError(f"{self.card.name} has no perturbed start")
 
+    def _transform(self, symmetry: Symmetry) -> None:
+        """Transform the start state by one of the card's symmetries, right after `_start`.
+
+        An environment whose card declares symmetries needs it: by it they are checked.
+        """
+        raise RecipeError(f"{self.card.name} has no transformed start")
+
     def _snapshot(self) -> Callable[[], None] | None:
         """A function that brings the simulator back to this moment, bit for bit; optional.
 
@@ -127,10 +135,12 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             seed: seeds the sequence of episodes, as in Gymnasium.
             options: ``{"spec": EpisodeSpec}`` selects the episode; ``{"split": …}`` and
                 ``{"factors": {name: setting}}`` configure a new one. ``{"perturbation": amount}``
-                perturbs its start, see `_perturb`.
+                perturbs its start, see `_perturb`; ``{"symmetry": Symmetry}`` transforms it before
+                that, see `_transform`.
 
         Raises:
-            RecipeError: unknown split or factor, an impossible factor value, or no perturbed start.
+            RecipeError: unknown split or factor, an impossible factor value, no perturbed or no
+                transformed start.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -143,6 +153,8 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self._factors = draw_factors(spec, self.card.factors, self.card.ood_shifts)
         self._frame_index = 0
         self._start(dict(self._factors), spec.rng("start"))
+        if symmetry := options.get("symmetry"):
+            self._transform(symmetry)
         amount = options.get("perturbation", 0.0)
         if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
             raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.data.clips import ClipDataset, DataConfig, hold_out, take_fraction
-from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.dataset import EpisodeDataset, declared_symmetries
 from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
 from acwm_core.data.loader import ClipLoader, ClipSampler, InOrder
 from acwm_core.data.streaming import ClipStream
@@ -39,6 +39,9 @@ class ClipData(L.LightningDataModule):
     Args:
         episodes: the split `train`.
         codec: frozen; encodes the clips once if the recipe caches latents.
+
+    Raises:
+        DataError: the recipe asks for symmetries that the data does not have.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class ClipData(L.LightningDataModule):
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
         training, validation = hold_out(len(self.episodes), config.validation_episodes)
         self._split = take_fraction(training, config.fraction), validation
+        self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
@@ -73,19 +77,29 @@ class ClipData(L.LightningDataModule):
     def setup(self, stage: str) -> None:
         """Encode clips that are not encoded yet, each rank a part on its device; open the clips."""
         if self._cached:
-            trainer = self._trainer()
-            self.codec.to(trainer.strategy.root_device)
+            self._encode()
+        training, validation = self._split
+        self._train = self._clips(
+            training,
+            self._stride,
+            cached=self._cached,
+            per_length=self.clips_per_step if self.trainer else self.config.batch_size,
+            symmetries=self._symmetries,
+        )
+        self._validation = self._clips(validation, self._stride, cached=self._cached)
+
+    def _encode(self) -> None:
+        trainer = self._trainer()
+        self.codec.to(trainer.strategy.root_device)
+        for symmetry in (None, *self._symmetries):
             encode_windows(
                 self.episodes,
                 self.codec,
                 frames=self.frames,
                 stride=self._stride,
+                symmetry=symmetry,
                 progress=trainer.is_global_zero,
             )
-        training, validation = self._split
-        count = self.clips_per_step if self.trainer else self.config.batch_size
-        self._train = self._clips(training, self._stride, cached=self._cached, per_length=count)
-        self._validation = self._clips(validation, self._stride, cached=self._cached)
 
     def train_dataloader(self) -> ClipLoader:
         """The stream of clips, starting after those of the steps done so far."""
@@ -148,7 +162,7 @@ class ClipData(L.LightningDataModule):
         return self.trainer
 
     def _clips(
-        self, episodes: Sequence[int], stride: int, *, cached: bool, per_length: int = 1
+        self, episodes: Sequence[int], stride: int, *, cached: bool, **of_clips: Any
     ) -> ClipDataset | LatentClipDataset:
         windows: dict[str, Any] = {
             "frames": self.frames,
@@ -156,7 +170,7 @@ class ClipData(L.LightningDataModule):
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
             "given": self.config.context_frames,
-            "per_length": per_length,
+            **of_clips,
         }
         if not cached:
             return ClipDataset(self.episodes, **windows)

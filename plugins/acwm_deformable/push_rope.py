@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor
+from acwm_core.env.symmetry import Symmetry
 from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.rope import NODES, POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope
@@ -72,6 +73,14 @@ _STATE = (
     StateField("pole_velocity", (2,), "m/s", "mean velocity of the pole since the last frame"),
 )
 
+_MIRROR = Symmetry(
+    (-1, 2),
+    mirrored=True,
+    states={
+        f"{what}_{how}": (-1, 2) for what in ("rope", "pole") for how in ("position", "velocity")
+    },
+)
+
 
 class PushRope(SceneEnvironment[Rope]):
     """A rope on a table and an upright pole that pushes it and is never lifted.
@@ -103,6 +112,7 @@ class PushRope(SceneEnvironment[Rope]):
         engine="Taichi (XPBD)",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        symmetries=(_MIRROR,),
     )
 
     longest_step = MAX_STEP
@@ -121,6 +131,10 @@ class PushRope(SceneEnvironment[Rope]):
         arms = (rope.nodes - middle) @ np.array([[c, s], [-s, c]])
         rope.nodes[:] = middle + arms + shift[:2]
         rope.pole[:] = np.clip(rope.pole + shift[2:], np.negative(POLE_ROOM), POLE_ROOM)
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        self.simulation.nodes[:, 0] *= -1
+        self.simulation.pole[0] *= -1
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         before = self.simulation.pole.astype(np.float64)

@@ -26,6 +26,11 @@ REMOVED = {"--skip-damaged": "a damaged shard stops with its name; make it again
     default=4,
     help="Frames between starts of an episode's clips.",
 )
+@click.option(
+    "--symmetries",
+    is_flag=True,
+    help="Also as each symmetry on the card of the data transforms it.",
+)
 @click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips per batch.")
 @click.option(
     "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
@@ -36,15 +41,16 @@ def encode(
     overrides: tuple[str, ...],
     name: str,
     split: str,
+    symmetries: bool,
     device: str,
     skip_damaged: bool,
     **windows: Any,
 ) -> None:
     """Encode the clips of a dataset as latents.
 
-    Latents go to DATA/latents. `acwm fit` uses them if codec, data.clip_frames (--frames) and
-    data.window_stride (--stride) are the same, and encodes missing ones itself. OVERRIDES set
-    the codec's parameters: codec.weights=random.
+    Latents go to DATA/latents. `acwm fit` uses them if codec, data.clip_frames (--frames),
+    data.window_stride (--stride) and data.symmetries are the same, and encodes missing ones itself.
+    OVERRIDES set the codec's parameters: codec.weights=random.
 
     If it is interrupted, run the same command again to continue. Several commands share the work,
     also on several machines with a shared folder.
@@ -55,7 +61,7 @@ def encode(
         raise RecipeError(f"{others[0]!r} sets no parameter of the codec; write codec.NAME=VALUE")
 
     from acwm_core.data.card import DatasetCard
-    from acwm_core.data.dataset import EpisodeDataset
+    from acwm_core.data.dataset import EpisodeDataset, declared_symmetries
     from acwm_core.data.latents import encode_windows
     from acwm_core.evaluation.evaluate import choose_device
     from acwm_core.model.build import build_codec
@@ -66,5 +72,7 @@ def encode(
         raise DataError(f"{data} has no split {split!r}, only {', '.join(known)} (or all)")
     codec = build_codec(ComponentConfig(name, parameters)).to(choose_device(device, "--device "))
     for chosen in known if split == "all" else (split,):
-        folder = encode_windows(EpisodeDataset(data, chosen), codec, **windows)
-        click.echo(f"{folder} holds the latents of {chosen}")
+        episodes = EpisodeDataset(data, chosen)
+        for symmetry in (None, *(declared_symmetries(episodes) if symmetries else ())):
+            folder = encode_windows(episodes, codec, symmetry=symmetry, **windows)
+            click.echo(f"{folder} holds the latents of {chosen}")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor
+from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import RecipeError
 from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher_arm import Arm, Links, Vector, wrapped
@@ -75,6 +76,18 @@ _STATE = (
     StateField("goal_position", (2,), "m", "middle of the marker, from the shoulder"),
 )
 
+_MIRROR = Symmetry(
+    (-1, -2),
+    mirrored=True,
+    states={
+        "joint_velocity": (-1, -2),
+        "elbow_position": (-1, 2),
+        "fingertip_position": (-1, 2),
+        "fingertip_velocity": (-1, 2),
+        "goal_position": (-1, 2),
+    },
+)
+
 
 class ReacherArm(SceneEnvironment[Arm]):
     """A two-link arm in a horizontal plane, on a walled floor with a flat marker as goal.
@@ -106,6 +119,7 @@ class ReacherArm(SceneEnvironment[Arm]):
         engine="MuJoCo",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        symmetries=(_MIRROR,),
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Arm:
@@ -123,6 +137,11 @@ class ReacherArm(SceneEnvironment[Arm]):
         arm = self.simulation
         angles = arm.angles + amount * rng.normal(0, 1e-3, 2)
         self.simulation = Arm(arm.links, angles, arm.goal)
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        arm = self.simulation
+        shoulder, elbow = arm.angles
+        self.simulation = Arm(arm.links, np.array([np.pi - shoulder, -elbow]), arm.goal * [-1, 1])
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         self._met = False

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor
+from acwm_core.env.symmetry import Symmetry, permuted
 from acwm_particle.physics import BOARD, HEIGHT_EXTENT
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID, SandDrawing
@@ -95,6 +96,18 @@ _STATE = (
     StateField("board_velocity", (3,), "m/s", "mean velocity of the board in the last frame"),
 )
 
+# Not of the sand's own state: the order in which grains are treated is not mirrored, so that a
+# mirrored heap shifts by a millimetre, and then grains part as after any other start.
+_MIRROR = Symmetry(
+    (-1, 2, 3, 4, 5, -6, -7),
+    mirrored=True,
+    states={
+        "board_position": (-1, 2, 3),
+        "board_quaternion": (1, 2, -3, -4),
+        "board_velocity": (-1, 2, 3),
+    },
+)
+
 
 class PushSand(SceneEnvironment[Sand]):
     """Sand on a table and a board that moves through it.
@@ -125,6 +138,7 @@ class PushSand(SceneEnvironment[Sand]):
         engine="Taichi (PBD)",
         episodes={"train": 1784, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        symmetries=(_MIRROR,),
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Sand:
@@ -144,6 +158,13 @@ class PushSand(SceneEnvironment[Sand]):
         (w, x, y, z), c, s = board.quaternion, np.cos(turn / 2), np.sin(turn / 2)
         turned = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
         self.simulation.put_board(Pose(board.position + shift[2:], turned))
+        self._before = self.simulation.board.position
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        board = self.simulation.board
+        self.simulation.grains[:, 0] *= -1
+        turn = permuted(board.quaternion, symmetry.states["board_quaternion"])
+        self.simulation.put_board(Pose(board.position * [-1, 1, 1], turn))
         self._before = self.simulation.board.position
 
     def _advance(self, action: NDArray[np.float32]) -> None:

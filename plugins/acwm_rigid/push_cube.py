@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor
+from acwm_core.env.symmetry import Axes, Symmetry, group
 from acwm_core.errors import RecipeError
 from acwm_rigid.physics import PUSHER_RADIUS
 from acwm_rigid.push_drawing import MAX_CUBES, PushDrawing, TwoPusherDrawing
@@ -71,6 +72,14 @@ _LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 10.0), "cube_size": (0.02, 0.
 """The factor values that the simulation accepts."""
 
 
+def _symmetry(pushers: int, axes: Axes, **of_frames: Any) -> Symmetry:
+    """A symmetry of the square table; `axes` say what it does to (x, y)."""
+    targets = [axis + (2 * k if axis > 0 else -2 * k) for k in range(pushers) for axis in axes]
+    # Velocities are left out: squeezed between others, things jerk in no predictable way.
+    places = {"pusher_position": axes, "cube_position": (*axes, 3)}
+    return Symmetry(tuple(targets), states=places, **of_frames)
+
+
 def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
     names = ["pusher"] if pushers == 1 else [f"pusher_{k + 1}" for k in range(pushers)]
     cubes = [f"cube_{k + 1}" for k in range(MAX_CUBES)]
@@ -95,6 +104,10 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
         engine="MuJoCo",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        symmetries=group(
+            _symmetry(pushers, (-1, 2), mirrored=True),
+            _symmetry(pushers, (-2, 1), quarter_turns=1),
+        ),
     )
 
 
@@ -155,6 +168,12 @@ class PushCube(SceneEnvironment[PushSimulation]):
             if not self.simulation.touching:
                 break
             amount /= 2
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        cubes, plane = self.simulation.cubes, symmetry.plane
+        yaw = (-cubes.yaw if symmetry.mirrored else cubes.yaw) + symmetry.quarter_turns * np.pi / 2
+        self._pushers = self._pushers @ plane.T
+        self.put(cubes.xy @ plane.T, yaw, self._pushers)
 
     def still_action(self) -> NDArray[np.float32]:
         """The action that keeps the pushers where they are."""

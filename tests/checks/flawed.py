@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from acwm_core.checks.disc import GAIN, SHADE, Disc
-from acwm_core.env.environment import StateField
+from acwm_core.env.environment import Environment, StateField
 from acwm_core.env.episode import Factor
 from tests.checks.results import Flaws
 
@@ -239,3 +239,34 @@ class TwinFactors(Disc):
         Disc.card,
         factors=(GAIN, SHADE, Factor.discrete("gain", "", train=(1,), ood=(2,), nominal=1)),
     )
+
+
+@FLAWS.caught_by("symmetries hold", "no group: turned180")
+class HalfAGroup(Disc):
+    card = replace(Disc.card, symmetries=Disc.card.symmetries[:2])
+
+
+@FLAWS.caught_by("symmetries hold", "no transformed start")
+class OnlyDeclares(Disc):
+    _transform = Environment._transform
+
+
+@FLAWS.caught_by("symmetries hold", "state 'position' differs")
+class LeansToTheRight(Disc):
+    def _advance(self, action):
+        super()._advance(action + np.float32([0.3, 0]))
+
+
+@FLAWS.caught_by("symmetries hold", "masks of 'disc' overlap")
+class SeenFromTheSide(Disc):
+    def _render(self):
+        frame, mask = super()._render()
+        return np.roll(frame, 8, 1), np.roll(mask, 8, 1)
+
+
+@FLAWS.caught_by("symmetries hold", "colour of 'disc' differs")
+class PaintedBySide(Disc):
+    def _render(self):
+        frame, mask = super()._render()
+        frame[mask == 1] = (220, 40, 40) if self.position[0] < 0 else (40, 40, 220)
+        return frame, mask
