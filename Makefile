@@ -42,7 +42,7 @@ types: $(VENV)/installed-all  ## Check types
 lowest:  ## Install the lowest versions that are declared, elsewhere, and use them
 	TORCH_INDEX="$(TORCH_INDEX)" .ci/lowest
 
-docs: $(VENV)/installed-all  ## Draw the pictures of docs/environments.md anew
+docs: $(VENV)/installed-all  ## Draw the pictures of docs/reference/environments.md anew
 	$(BIN)/python docs/build_environments.py
 
 site: $(VENV)/installed-all  ## Build the site of the documents in site/

@@ -1,4 +1,4 @@
-"""Draw the pictures of environments.md: `python docs/build_environments.py [ENVIRONMENT ...]`.
+"""Draw the pictures of reference/environments.md: `docs/build_environments.py [ENVIRONMENT ...]`.
 
 Simulates the named environments, or by default all that ship with acwm.
 """
@@ -126,7 +126,9 @@ def _save(picture: Picture, name: str) -> None:
 
 def main() -> None:
     """Draw the requested pictures."""
-    parser = argparse.ArgumentParser(description="Draw the pictures of docs/environments.md.")
+    parser = argparse.ArgumentParser(
+        description="Draw the pictures of docs/reference/environments.md."
+    )
     parser.add_argument("environments", nargs="*", help="whose pictures; by default all")
     chosen = parser.parse_args()
     found = cards()

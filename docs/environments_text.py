@@ -1,4 +1,4 @@
-"""Text of environments.md, made from the cards of all environments that ship with acwm.
+"""Text of reference/environments.md, made from the cards of all environments that ship with acwm.
 
 The overview is part of the page; the site adds a section on every environment.
 """
@@ -87,13 +87,13 @@ def _section(card: EnvironmentCard) -> list[str]:
         f"{card.engine} · {_size(card)} pixels · {card.fps} frames per second · {card.horizon} "
         f"frames ({card.horizon / card.fps:g} s) · {_episodes(card)} episodes (train / ind_test / "
         f"ood_test) · {card.citation}",
-        f"![{card.name}, in distribution](environments/{card.name}_ind.jpg)",
-        f"![{card.name}, out of distribution](environments/{card.name}_ood.jpg)",
+        f"![{card.name}, in distribution](../environments/{card.name}_ind.jpg)",
+        f"![{card.name}, out of distribution](../environments/{card.name}_ood.jpg)",
         _action(card.action),
         _factors(card),
     ]
     if any(not factor.active for factor in card.factors):
-        parts.append(f"![{card.name}, its factors](environments/{card.name}_factors.jpg)")
+        parts.append(f"![{card.name}, its factors](../environments/{card.name}_factors.jpg)")
     return [*parts, _state(card.state), _instances(card)]
 
 
@@ -107,7 +107,7 @@ def _notes(card: EnvironmentCard) -> list[str]:
 def _variant(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:
     """The section of a variant: where it differs from its base."""
     parts = [f"### {card.name}", f"*Variant of {base.name}.* {card.summary}"]
-    parts.append(f"![{card.name}](environments/{card.name}.jpg)")
+    parts.append(f"![{card.name}](../environments/{card.name}.jpg)")
     if _facts(card) != _facts(base):
         parts.append(_facts(card))
     if card.action != base.action:

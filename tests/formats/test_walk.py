@@ -1,4 +1,4 @@
-"""The page about one's own data is walked: every command and the Python in it, in order."""
+"""The pages about one's own data are walked: every command and the Python in them, in order."""
 
 import re
 import shlex
@@ -18,7 +18,8 @@ from tests.formats.corpus.cases import Case, three
 from tests.formats.test_command_line import QUICK, QUICK_EVALUATION
 from tests.formats.test_from_lerobot import REFERENCE
 
-PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = [DOCS / "your-own-data.md", DOCS / "reference" / "formats.md"]
 TAKES = Case("takes", three(), names=("take 1", "take 2", "take 3"), column="time")
 LARGE = replace(TAKES, size=(96, 128))
 """As a camera takes them: larger than a small model's frames."""
@@ -49,7 +50,7 @@ def desk(tmp_path, monkeypatch):
 
 @pytest.mark.ci
 def test_every_step_works(desk):
-    text = PAGE.read_text()
+    text = "".join(page.read_text() for page in PAGES)
     commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)
     assert len(commands) == 17
     for line in commands:
@@ -60,7 +61,7 @@ def test_every_step_works(desk):
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, f"{line}: {result.output}"
     for code in re.findall(r"^```python\n(.*?)^```", text, re.M | re.S):
-        exec(compile(code, str(PAGE), "exec"), {"__name__": "walk"})
+        exec(compile(code, "walk", "exec"), {"__name__": "walk"})
     made = {path.parent.name for path in Path("data").rglob("card.yaml")}
     shown = set(re.findall(r"--out data/(\w+)", text))
     assert made == {*shown, "arm", "cubes", "reacher"} - {"published"}

@@ -1,4 +1,4 @@
-"""docs/environments.md lists all environments; the site says all that their cards say."""
+"""docs/reference/environments.md lists all environments; the site says all that their cards say."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = DOCS / "environments.md"
+PAGE = DOCS / "reference" / "environments.md"
 
 
 @pytest.fixture(scope="module")
@@ -34,5 +34,5 @@ def test_the_page_has_the_table_and_the_place_of_the_sections(text, found):
 def test_its_pictures_are_all_there_and_no_others(text, found):
     shown = PAGE.read_text() + text.sections(found)
     kept = {f"environments/{path.name}" for path in (DOCS / "environments").iterdir()}
-    assert set(re.findall(r"\]\((environments/[^)]+)\)", shown)) == kept, "run: make docs"
+    assert set(re.findall(r"\]\(\.\./(environments/[^)]+)\)", shown)) == kept, "run: make docs"
     assert sum((DOCS / name).stat().st_size for name in kept) <= 3 * 2**20
