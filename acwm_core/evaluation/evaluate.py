@@ -55,11 +55,13 @@ class Entrant:
         parts: see `Summary.parts`.
         facts: what predicted, for `Summary.provenance`.
         published: see `Summary.published`.
+        secret: whether the results keep the seed of the test data to themselves.
     """
 
     parts: dict[str, str]
     facts: dict[str, Any]
     published: Published | None = None
+    secret: bool = False
 
 
 def evaluate_run(
@@ -171,7 +173,8 @@ def _evaluate(
     summary.videos.extend(record for record, _ in videos)
     for _, damaged in planned.values():
         summary.left_out.update(damaged)
-    summary.provenance.update(provenance(evaluator, datasets, entrant.facts))
+    facts = provenance(evaluator, datasets, entrant.facts, secret=entrant.secret)
+    summary.provenance.update(facts)
     summary.provenance["seconds"] = round(time.monotonic() - started, 1)
     _write(home, summary, scores, videos)
     return summary

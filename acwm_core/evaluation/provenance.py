@@ -39,12 +39,17 @@ def run_facts(folder: RunFolder, recipe: Recipe, evaluator: Evaluator) -> dict[s
 
 
 def provenance(
-    evaluator: Evaluator, datasets: Mapping[str, EpisodeDataset], predictor: Mapping[str, Any]
+    evaluator: Evaluator,
+    datasets: Mapping[str, EpisodeDataset],
+    predictor: Mapping[str, Any],
+    *,
+    secret: bool = False,
 ) -> dict[str, Any]:
     """Everything needed to reproduce the results, as JSON types.
 
     Args:
         predictor: what predicted, see `run_facts`.
+        secret: whether to leave out the seed from which the test data can be simulated.
     """
     dataset = next(iter(datasets.values()))
     card, device = dataset.card, evaluator.device
@@ -62,10 +67,10 @@ def provenance(
             "environment": card.environment.name,
             "frame_size": list(card.environment.frame_size),
             "episodes": dict(card.splits),
-            "seed": card.seed,
+            "seed": None if secret else card.seed,
             "options": dict(card.options),
             "source": dict(card.source),
-            "command": card.command(dataset.path),
+            "command": "" if secret else card.command(dataset.path),
             "factors": dict(card.factors),
             "checksums": {split: each.checksum for split, each in datasets.items()},
             "versions": dict(card.versions),

@@ -251,7 +251,8 @@ class Summary:
 
     Attributes:
         run: name of the run folder.
-        parts: registered names of environment, codec, model and conditioner.
+        parts: registered names of environment, codec, model and conditioner; of predictions that
+            were handed in only the environment and, as the model, the entry's name.
         metrics: the metrics that were measured, in the order of the recipe.
         headline: the metric that ranks clips.
         splits: results per test split.
@@ -277,6 +278,17 @@ class Summary:
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
     published: Published | None = None
+
+    @property
+    def handed_in(self) -> bool:
+        """Whether predictions that were made elsewhere were scored, and not the model of a run."""
+        return "predictions_sha256" in self.provenance
+
+    @property
+    def predictor(self) -> str:
+        """SHA-256 of what predicted: weights, or predictions that were handed in."""
+        of = "predictions" if self.handed_in else "weights"
+        return self.provenance[f"{of}_sha256"]
 
     def write(self, folder: Path) -> None:
         """Write ``summary.json`` into the evaluation folder of a run, without NaN or infinity."""

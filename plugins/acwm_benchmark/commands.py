@@ -10,10 +10,10 @@ import click
 from acwm_core.cli.arguments import FOLDER, OUT_FOLDER, size
 
 
-def _count(context: click.Context, option: click.Parameter, text: str) -> int | None:
-    """Parse a number of episodes; None stands for ``all``."""
-    if text == "all":
-        return None
+def _count(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
+    """Parse a number of episodes; 0 stands for ``all``."""
+    if text in (None, "all"):
+        return None if text is None else 0
     if not text.isdigit() or int(text) < 2:
         raise click.BadParameter(f"{text}: give a number from 2 on, or all")
     return int(text)
@@ -34,7 +34,11 @@ def benchmark() -> None:
     "default it is simulated into OUT-truth.",
 )
 @click.option("--size", type=size, help="Frame size; by default the environment's.")
-@click.option("--episodes", default="64", callback=_count, help="Of each test split; or all.")
+@click.option(
+    "--episodes",
+    callback=_count,
+    help="Number of episodes of each test split, or all; the protocol's or 64 by default.",
+)
 @click.option(
     "--seed",
     type=click.IntRange(0),

@@ -34,7 +34,11 @@ from acwm_core.recipe.compose import read_recipe, recipe_folder
 PUBLIC = 0
 """The seed of the public benchmark; any other is kept secret."""
 
-ALL = "all"
+USUAL_EPISODES = 64
+"""Number of episodes of each test split, if neither a person nor the protocol says another."""
+
+ALL = 0
+"""Stands for all episodes."""
 
 OF_NETWORKS: dict[str, Any] = {"steps_sweep": (), "device": "cpu"}
 """Settings of which predictions that were made elsewhere know nothing."""
@@ -56,7 +60,7 @@ def export_tasks(
     *,
     data: str | Path | None = None,
     size: int | tuple[int, int] | None = None,
-    episodes: int | None = 64,
+    episodes: int | None = None,
     seed: int = PUBLIC,
     overrides: Sequence[str] = (),
     workers: int | None = None,
@@ -70,7 +74,8 @@ def export_tasks(
         data: the test data: a dataset, or a folder with one per world. By default it is simulated
             into the folder ``OUT-truth``.
         size: frame size of simulated data; by default the environment's.
-        episodes: number of episodes of each test split; None for all.
+        episodes: number of episodes of each test split, or `ALL`; by default the protocol's, or
+            else `USUAL_EPISODES`.
         seed: seed of simulated data. It is told to participants only if it is `PUBLIC`.
         overrides: settings of the evaluation, such as ``evaluation.context_frames=5``.
         workers: processes that simulate, one per core by default.
@@ -83,8 +88,10 @@ def export_tasks(
     out = Path(out)
     if out.exists() and any(out.iterdir()):
         raise DataError(f"{out} is not empty: choose another --out, or delete it first")
-    wanted = [f"evaluation.episodes={episodes}"] if episodes else []
-    config = evaluation_config([*overrides, *wanted])
+    config = evaluation_config(overrides)
+    if episodes is None:
+        episodes = config.episodes or USUAL_EPISODES
+    config = replace(config, episodes=episodes or None)
     place = truth_beside(out) if data is None else Path(data)
     if data is None:
         for name in worlds:
@@ -120,12 +127,12 @@ def evaluation_config(overrides: Sequence[str]) -> EvaluationConfig:
     return replace(checked, context_frames=checked.context_frames or 1)
 
 
-def _simulate(name: str, out: Path, size: Any, episodes: int | None, seed: int, *more: Any) -> None:
+def _simulate(name: str, out: Path, size: Any, episodes: int, seed: int, *more: Any) -> None:
     """Simulate as many test episodes of a world as are asked for."""
     component = catalog().component("environment", name)
     with contextlib.closing(make_environment(component, {})) as environment:
         usual = environment.card.episodes
-    if episodes is None and not usual:
+    if episodes == ALL and not usual:
         raise RecipeError(f"{name} does not say how many episodes it has: give --episodes")
     counts = {split: episodes or usual[split] for split in TESTS}
     simulate(name, out, counts, size, seed, *more)
@@ -146,15 +153,19 @@ def _export_world(
     branches = [
         _write(folder, name, each) for each in _of_branches(name, clips, datasets, config, frames)
     ]
+    whole = all(len(each) <= (config.episodes or len(each)) for each in datasets.values())
+    config = replace(
+        config,
+        episodes=None if whole else config.episodes,  # then tasks of all are called so
+        counterfactual_episodes=config.counterfactual_episodes if branches else 0,
+    )
     world = World(
         name=name,
         summary=environment.summary,
         size=environment.frame_size,
         fps=environment.fps,
         actions=asdict(environment.action),
-        evaluation=replace(
-            config, counterfactual_episodes=config.counterfactual_episodes if branches else 0
-        ).to_dict(),
+        evaluation=config.to_dict(),
         checksums={split: each.checksum for split, each in datasets.items()},
         episodes={split: len(each) for split, each in datasets.items()},
         branch_frames=frames,

@@ -27,6 +27,7 @@ _DRAW = re.compile(r"(.+)\.(\d+)")
 class Predictions:
     """The predictions of one world's tasks: for each id the file or folder of each draw."""
 
+    folder: Path
     world: World
     tasks: Mapping[str, Task]
     files: Mapping[str, Sequence[Path]]
@@ -109,9 +110,8 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
     faults += [f"{name}: its prediction is missing" for name in wanted if name not in found]
     faults += _of_draws(found)
     _refuse(faults)
-    return Predictions(
-        world, wanted, {name: [found[name][n] for n in sorted(found[name])] for name in wanted}
-    )
+    files = {name: [found[name][draw] for draw in sorted(found[name])] for name in wanted}
+    return Predictions(folder, world, wanted, files)
 
 
 def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:

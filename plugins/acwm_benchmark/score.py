@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from acwm_benchmark.entry import Entry, read_entry
 from acwm_benchmark.model import HandedIn
 from acwm_benchmark.predictions import Predictions, find_predictions
 from acwm_benchmark.tasks import BENCHMARK, Tasks, World
@@ -21,6 +20,7 @@ from acwm_core.evaluation.results import FOLDER, Summary
 from acwm_core.files import writing
 from acwm_core.recipe.check import check_section
 from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
+from acwm_report.entry import Entry, read_entry
 
 
 def score_predictions(
@@ -95,6 +95,8 @@ def _score(
     card = next(iter(datasets.values())).card.environment
     evaluator = evaluator_of(model, card, settings_of(world, tasks), rows)
     facts = {
+        "predictions": str(predictions.folder),
+        "tasks": str(tasks.folder),
         "predictions_sha256": predictions.checksum,
         "tasks_sha256": tasks.checksum,
         "entry": asdict(entry),
@@ -102,7 +104,8 @@ def _score(
         "coding": str(predictions.coding or "lossless"),
     }
     parts = {"env": world.name, "model": entry.name}
-    entrant = Entrant(parts, facts, published_for({"env": world.name}))
+    secret = world.seed is None and not world.source
+    entrant = Entrant(parts, facts, published_for({"env": world.name}), secret)
     return evaluate_clips(
         evaluator, datasets, home, entrant, overwrite=overwrite, progress=progress
     )

@@ -59,7 +59,8 @@ def pair_charts(run: EvaluatedRun) -> list[Chart]:
     name = run.summary.headline
     label = _axis(run.headline, Scale(1.0, 0, run.headline.unit))
     charts: list[Chart] = []
-    for split, result in run.summary.splits.items():
+    of_both = {s: r for s, r in run.summary.splits.items() if "shuffled" in r.scores.paired}
+    for split, result in of_both.items():
         rows = sorted(
             (r for r in run.results if r.split == split), key=lambda r: (r.episode, r.start)
         )
@@ -171,7 +172,7 @@ def smooth(values: list[float]) -> list[float]:
 
 def severity_charts(run: EvaluatedRun) -> list[Chart]:
     """One chart per factor that was swept with the run's weights; the training range is shaded."""
-    weights = run.summary.provenance["weights_sha256"]
+    weights = run.summary.predictor
     return [_severity(curve, run.key) for curve in read_severity(run.folder, weights)]
 
 
@@ -181,7 +182,7 @@ def outdated_curves(run: EvaluatedRun) -> list[tuple[SeverityCurve, bool]]:
     return [
         (curve, curve.provenance["evaluated"] <= facts["evaluated"])
         for curve in read_severity(run.folder)
-        if curve.provenance["weights_sha256"] != facts["weights_sha256"]
+        if curve.provenance["weights_sha256"] != run.summary.predictor
     ]
 
 

@@ -7,8 +7,22 @@ from typing import Any
 
 import click
 
-from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN
+from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN, Run
 from acwm_report.terminal import print_severity, print_summary
+
+
+class Evaluated(Run):
+    """A run folder, or a folder with the scores of predictions that were handed in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path of the folder."""
+        from acwm_core.evaluation import results
+
+        scored = (Path(value) / results.FOLDER / results.SUMMARY).is_file()
+        return Path(value) if scored else super().convert(value, param, ctx)
+
+
+EVALUATED = Evaluated("run folder", "recipe.yaml", "`acwm fit RECIPE`")
 
 
 @click.command()
@@ -88,7 +102,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 
     found: list[Path] = []
     for run in runs:
-        found += evaluated_runs(run) if is_experiment(run) else [RUN.convert(run, None, None)]
+        found += evaluated_runs(run) if is_experiment(run) else [EVALUATED.convert(run, None, None)]
     experiment = Experiment.read(runs[0]) if len(runs) == 1 and is_experiment(runs[0]) else None
 
     from acwm_report.page import export_report, write_report
@@ -104,7 +118,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 
 
 @click.command()
-@click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN RUN...")
+@click.argument("runs", type=EVALUATED, nargs=-1, required=True, metavar="RUN RUN...")
 @click.option("--metric", "metrics", multiple=True, help="Compare this metric; all by default.")
 @click.option("--split", "splits", multiple=True, help="Compare on this split; all by default.")
 @click.option("--out", type=OUT_FILE, help="Also write the result to this .json.")
@@ -129,15 +143,16 @@ def compare(
 @click.command()
 @click.argument("folder", type=FOLDER, metavar="DIR")
 @click.option("--out", type=OUT_FILE, help="Output .html; leaderboard.html in DIR by default.")
-def leaderboard(folder: Path, out: Path | None) -> None:
+@click.option("--video-mb", default=16.0, help="Megabytes of video to embed.")
+def leaderboard(folder: Path, out: Path | None, video_mb: float) -> None:
     """Collect the results of many runs in one page.
 
-    Finds result files (summary.json) at any depth below DIR and makes one table per environment,
-    test data and protocol. Names files that cannot be read.
+    Finds result files (summary.json) at any depth below DIR, and makes one table per environment,
+    test data, protocol and capability, and a card of each entry. Names files that cannot be read.
     """
     from acwm_report.leaderboard import write_leaderboard
 
-    page, found = write_leaderboard(folder, out)
+    page, found = write_leaderboard(folder, out, megabytes=video_mb)
     for name, why in found.broken.items():
         click.echo(f"left out {name}: {why}", err=True)
     click.echo(page)

@@ -70,7 +70,8 @@ class Comparison:
     """The result of ``acwm compare``, written as JSON."""
 
     runs: dict[str, str]  # folder of every run, by label
-    # SHA-256 of ``recipe``, ``weights`` and the test data of each split, by label of the run
+    # SHA-256 of ``recipe`` and ``weights``, or ``predictions`` and ``tasks`` of what was handed in,
+    # and of the test data of each split, by label of the run
     hashes: dict[str, dict[str, str]]
     environment: str  # registered name
     protocol: str  # protocol of the evaluations
@@ -129,11 +130,7 @@ def compare_runs(
         raise DataError("no metric is defined on the clips that the runs share")
     return Comparison(
         runs={label: str(folder) for label, folder in zip(summaries, folders, strict=True)},
-        hashes={
-            label: {n: each.provenance[f"{n}_sha256"] for n in ("recipe", "weights")}
-            | checksums(each)
-            for label, each in summaries.items()
-        },
+        hashes={label: _hashes(each) | checksums(each) for label, each in summaries.items()},
         environment=first.parts["env"],
         protocol=first.protocol,
         units={name: info.unit for name, info in metrics_of.items()},
@@ -203,6 +200,7 @@ def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
     warnings: list[str] = []
     for what, fact in _SHOULD_AGREE:
         facts = {label: fact(summary) for label, summary in summaries.items()}
+        facts = {label: each for label, each in facts.items() if each is not None}
         if len(set(map(repr, facts.values()))) > 1:
             warnings.append(f"{what} differ: " + ", ".join(f"{k} {v}" for k, v in facts.items()))
     return warnings
@@ -216,6 +214,12 @@ def _definitions(summaries: Mapping[str, Summary], names: Sequence[str]) -> list
     return [f"definitions of {', '.join(changed)} differ: {remedy}"] if changed else []
 
 
+def _hashes(summary: Summary) -> dict[str, str]:
+    """SHA-256 of what predicted."""
+    names = ("predictions", "tasks") if summary.handed_in else ("recipe", "weights")
+    return {name: summary.provenance[f"{name}_sha256"] for name in names}
+
+
 def checksums(summary: Summary) -> dict[str, str]:
     """SHA-256 of the test data, by split."""
     return summary.provenance["dataset"]["checksums"]
@@ -226,14 +230,19 @@ def _estimator(summary: Summary) -> str:
     return " and ".join(f"{what} {hashed}" for what, hashed in facts.items()) or "none"
 
 
+def _mode(summary: Summary) -> str | None:
+    """How the model went on; None if nobody knows."""
+    return None if summary.handed_in else summary.provenance.get("mode", "windows")
+
+
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
     ("on other environments", lambda s: s.parts["env"], "their clips cannot be compared"),
     ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
 )
 
 _SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
-    ("numbers of sampling steps", lambda s: s.provenance["sampling_steps"]),
-    ("ways of rolling forward", lambda s: s.provenance.get("mode", "windows")),
+    ("numbers of sampling steps", lambda s: s.provenance.get("sampling_steps")),
+    ("ways of rolling forward", _mode),
     ("numbers of given frames", lambda s: s.provenance.get("context_frames", 1)),
     ("seeds of the noise", lambda s: s.provenance["evaluation"].get("seed")),
     ("estimators of states", _estimator),

@@ -69,7 +69,7 @@ def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
 
 def plan_results(run: EvaluatedRun) -> dict[Path, PlanTable]:
     """The plan tables made with the evaluated weights; see `plan_tables_of`."""
-    return plan_tables_of(run.folder, run.summary.provenance["weights_sha256"])
+    return plan_tables_of(run.folder, run.summary.predictor)
 
 
 def distance_scale(unit: str) -> Scale:

@@ -19,7 +19,7 @@ JUDGES = {
 
 def rankings(run: EvaluatedRun) -> list[Ranking]:
     """The rankings made with the evaluated weights, in order of their tasks."""
-    return rankings_of(run.folder, run.summary.provenance["weights_sha256"])
+    return rankings_of(run.folder, run.summary.predictor)
 
 
 def rankings_of(run: Path, weights: str) -> list[Ranking]:

@@ -21,6 +21,12 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     Evaluation settings that the run's own recipe already contains are not repeated.
     """
     facts, data = summary.provenance, summary.provenance["dataset"]
+    if summary.handed_in:
+        own = facts["predictions"], summary.parts["env"], "--tasks", facts["tasks"]
+        again = f"{folder.parent}-again"
+        score = shlex.join(["acwm", "score", *own, "--data", data["path"], "--out", again])
+        made = [] if _is_fetched(data["path"]) or not data["command"] else [data["command"]]
+        return [*made, score, shlex.join(["acwm", "report", f"{again}/{folder.name}"])]
     original = folder / "recipe.yaml"
     recipe = read_recipe(original)
     trained_on, tested_on = str(recipe.get("data", {}).get("path", "")), Path(data["path"])

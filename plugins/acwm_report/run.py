@@ -57,7 +57,7 @@ class EvaluatedRun:
         """The model's advantage over each baseline in the headline metric; positive is better."""
         sign = 1 if self.headline.higher_is_better else -1
         found: dict[str, Estimate] = {}
-        for each in OVER:
+        for each in (name for name in OVER if name in scores.paired):
             was = scores.paired[each][self.summary.headline].difference
             ends = (was.value, *(was.low, was.high)[::sign])
             found[each] = Estimate(*(None if end is None else sign * end for end in ends))
@@ -69,7 +69,10 @@ class EvaluatedRun:
         gains = self.gains(next(iter(self.summary.splits.values())).scores)
         if all(gain.low is None for gain in gains.values()):
             return "Too few episodes for a verdict"
-        predicts, conditioned = ((gains[each].low or 0) > 0 for each in ("copy", "shuffled"))
+        better = {each: (gain.low or 0) > 0 for each, gain in gains.items()}
+        if "shuffled" not in better:
+            return f"{'Better' if better['copy'] else 'No better'} than a still frame"
+        predicts, conditioned = better["copy"], better["shuffled"]
         if predicts and conditioned:
             return "Action-conditioned prediction"
         if conditioned:

@@ -140,19 +140,21 @@ def label_tables(run: EvaluatedRun) -> list[Table]:
     if all(strong for _, _, strong in groups):
         return []
     name, scale = run.summary.headline, run.headline_scale()
-    gains = [Column(f"over {each}", scale.unit) for each in ("the copy", "other actions")]
-    score, ceiling = Column(run.headline.title, scale.unit), Column("Codec ceiling", scale.unit)
-    columns = [Column("Number"), score, *gains, Column("true actions win"), ceiling]
+    first = groups[0][1]
+    over = {"copy": "over the copy", "shuffled": "over other actions"}
+    columns = [Column("Number"), Column(run.headline.title, scale.unit)]
+    columns += [Column(title, scale.unit) for each, title in over.items() if each in first.paired]
+    columns += [Column("true actions win")] * ("shuffled" in first.paired)
+    columns += [Column("Codec ceiling", scale.unit)] * ("codec" in first.rows)
     rows: list[Row] = []
     for title, scores, strong in groups:
-        pair = scores.paired["shuffled"][name]
-        cells = [
-            Cell(str(scores.clips)),
-            Cell.of(scores.rows["model"][name], scale),
-            *(Cell.of(gain, scale, signed=True) for gain in run.gains(scores).values()),
-            Cell(f"{pair.better}/{pair.clips}"),
-            Cell(scale.number(scores.rows["codec"][name].value)),
-        ]
+        cells = [Cell(str(scores.clips)), Cell.of(scores.rows["model"][name], scale)]
+        cells += [Cell.of(gain, scale, signed=True) for gain in run.gains(scores).values()]
+        if "shuffled" in scores.paired:
+            pair = scores.paired["shuffled"][name]
+            cells.append(Cell(f"{pair.better}/{pair.clips}"))
+        if "codec" in scores.rows:
+            cells.append(Cell(scale.number(scores.rows["codec"][name].value)))
         rows.append(Row(title, cells, strong=strong))
     return [Table("", columns, rows, "Episodes", name="shifts")]
 
@@ -169,10 +171,10 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     windows = any(result.start for result in run.results)
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
     key = f"{headline}_over_other_actions"
-    columns.append(Column("over other actions", scales[headline].unit, key=key))
+    others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
+    columns += [Column("over other actions", scales[headline].unit, key=key)] * bool(others)
     columns += [Column.of(info, scales[name], name) for name, info in summary.metrics.items()]
     links = {_clip(each.record): each.key for each in videos if each.record.kind == "model"}
-    others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
     splits = list(summary.splits)
     sign = 1 if run.headline.higher_is_better else -1
 
@@ -186,9 +188,10 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
         cells = [Cell(split_title(result.split)), Cell(label_title(result.ood_label) or MISSING)]
         cells += [Cell(str(result.start), value=result.start)] * windows
         cells.append(Cell("▶ play" * bool(link), link=link))
-        other = others.get(_clip(result), float("nan"))
-        gain = sign * (result.values[headline] - other) if result.values[headline] != other else 0.0
-        cells.append(Cell.of(Estimate(defined(gain)), scales[headline], signed=True))
+        if others:
+            own, other = result.values[headline], others.get(_clip(result), float("nan"))
+            gain = sign * (own - other) if own != other else 0.0
+            cells.append(Cell.of(Estimate(defined(gain)), scales[headline], signed=True))
         for name, scale in scales.items():
             cells.append(Cell.of(Estimate(defined(result.values[name])), scale))
         rows.append(Row(str(result.episode), cells))

@@ -48,13 +48,12 @@ def print_summary(summary: Summary) -> None:
     console = Console(highlight=False, markup=False)
     for split, result in summary.splits.items():
         console.print(_split_table(summary, split))
-        _print_remarks(result.scores)
+        _print_remarks(result.scores, summary.handed_in)
         if phrase := draws_phrase(summary, split):
             click.echo(f"{split}: {phrase}")
-    click.echo(
-        "± is half the 95 % confidence interval over episodes; `other actions`: the model was "
-        "given another episode's actions"
-    )
+    others = "; `other actions`: the model was given another episode's actions"
+    told = any("shuffled" in result.scores.rows for result in summary.splits.values())
+    click.echo(f"± is half the 95 % confidence interval over episodes{others * told}")
     if any(r.scores.shares.get("model") for r in summary.splits.values()):
         click.echo(
             "scored: share of the bodies and frames in which the model shows what is measured"
@@ -68,12 +67,13 @@ def print_summary(summary: Summary) -> None:
         click.echo(about_published(summary))
 
 
-def _print_remarks(scores: SetSummary) -> None:
+def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
     """Print who makes the error, which predictions failed, and which scores are left out."""
+    better = "hand in PNG or NPZ" if handed_in else "see `acwm train-codec`"
     from acwm_core.evaluation.shares import error_shares
 
     if found := error_shares(scores):
-        click.echo(f"{found}{': see `acwm train-codec`' if found.codec > MUCH else ''}")
+        click.echo(f"{found}{f': {better}' if found.codec > MUCH else ''}")
     for row in scores.failed:
         failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"
         click.echo(f"{failures}: their scores count as infinitely bad")

@@ -63,7 +63,7 @@ KINDS = {"ranking": "ranking policies", "planning": "planning"}
 
 def uses_of(label: str, run: Path, summary: Summary) -> list[Use]:
     """The rankings and plans in a run folder that were made with the evaluated weights."""
-    weights = summary.provenance["weights_sha256"]
+    weights = summary.predictor
     ranked = [each for found in rankings_of(run, weights) for each in _ranked(label, found)]
     tables = plan_tables_of(run, weights).values()
     return ranked + [each for found in tables for each in _planned(label, found)]

@@ -19,8 +19,8 @@ from acwm_core.evaluation.storage import read_scores
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder
+from acwm_report.boards import boards_of
 from acwm_report.comparison import compare_runs
-from acwm_report.leaderboard import boards_of
 from acwm_report.page import write_report
 from tests import tiny
 

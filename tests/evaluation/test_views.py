@@ -22,8 +22,8 @@ from acwm_dream.captions import HEIGHT
 from acwm_dream.rollout import rollout_run
 from acwm_metrics.fvd import FVD
 from acwm_metrics.pixel import SSIM
+from acwm_report.boards import boards_of
 from acwm_report.comparison import compare_runs
-from acwm_report.leaderboard import boards_of
 from acwm_report.run import EvaluatedRun
 from acwm_report.tables import score_tables
 from tests import tiny

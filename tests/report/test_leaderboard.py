@@ -8,7 +8,8 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
-from acwm_report.leaderboard import boards_of, collect, write_leaderboard
+from acwm_report.boards import boards_of
+from acwm_report.leaderboard import collect, write_leaderboard
 from tests.report import synthetic
 from tests.report.test_page import Page
 
@@ -99,7 +100,7 @@ def test_the_page_is_well_formed_and_says_what_it_left_out(folder, tmp_path, cap
     assert all(load.startswith(("data:", "#")) for load in parsed.loads)
     assert "https://" not in text
     words = " ".join(" ".join(parsed.text).split())
-    for name in ("a/deeper/second", "other_world", "old/evaluation/summary.json", "6 runs"):
+    for name in ("a/deeper/second", "other_world", "old/evaluation/summary.json", "6 entries"):
         assert name in words
     assert "1 further file is a copy" in words
 
