@@ -52,6 +52,7 @@ class Given:
     clip: Clip
     frames: NDArray[np.uint8]  # `[K, H, W, 3]`
     actions: NDArray[np.float32]  # `[T, A]`
+    branch: bool = False
 
 
 def export_tasks(
@@ -204,7 +205,7 @@ def _of_branches(
                 for number, actions in enumerate(rows):
                     if not np.array_equal(actions, whole.actions):  # else it is the clip itself
                         name = f"{_name(world, clip)}-branch-{number:02d}"
-                        yield Given(name, clip, shown, actions)
+                        yield Given(name, clip, shown, actions, branch=True)
 
 
 def _name(world: str, clip: Clip) -> str:
@@ -219,8 +220,16 @@ def _write(folder: Path, world: str, given: Given) -> Task:
         Image.fromarray(frame).save(folder / name)
     actions = f"{given.id}.npz"
     np.savez_compressed(folder / actions, actions=given.actions)
-    count = len(given.actions)
-    return Task(given.id, world, count, len(given.frames), images, actions, given.clip.seed)
+    return Task(
+        id=given.id,
+        world=world,
+        frames=len(given.actions),
+        given=len(given.frames),
+        images=images,
+        actions=actions,
+        seed=given.clip.seed,
+        branch=given.branch,
+    )
 
 
 def _write_readme(folder: Path, worlds: Mapping[str, World], tasks: Sequence[Task]) -> None:

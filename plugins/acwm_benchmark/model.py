@@ -12,6 +12,7 @@ from acwm_benchmark.lossy import Lossless, LossyVideo
 from acwm_benchmark.predictions import Predictions
 from acwm_benchmark.tasks import Task, Tasks
 from acwm_core.errors import DataError
+from acwm_core.evaluation.clips import draw_seeds
 from acwm_core.model.shapes import Actions, Video
 from acwm_core.model.world_model import Mode
 
@@ -22,10 +23,11 @@ TOLERANCE = 1e-4
 class HandedIn:
     """A `VideoModel` that knows the clips of some tasks, and nothing else.
 
-    A clip is found by the seed of its noise, which stands for its start, and by its actions.
+    A draw of a clip is found by the seed of its noise, which stands for the clip's start and for
+    the number of the draw, and by the actions.
     """
 
-    steps, samples = None, False
+    steps = None
     device = torch.device("cpu")
 
     def __init__(self, tasks: Tasks, predictions: Predictions) -> None:
@@ -37,11 +39,14 @@ class HandedIn:
         if coding is not None:
             sample = next(iter(predictions.files.values()))[0]
             self.codec = LossyVideo(coding, sample, world.fps)
+        self.samples = predictions.draws > 1
         self._predictions = predictions
         self._span = np.subtract(world.actions["high"], world.actions["low"])
-        self._known: dict[int, list[tuple[Task, NDArray[np.float32]]]] = {}
+        self._known: dict[int, list[tuple[Task, int, NDArray[np.float32]]]] = {}
         for task in predictions.tasks.values():
-            self._known.setdefault(task.seed, []).append((task, tasks.actions(task)))
+            actions = tasks.actions(task)
+            for draw, seed in enumerate(draw_seeds(task.seed, len(predictions.files[task.id]))):
+                self._known.setdefault(seed, []).append((task, draw, actions))
 
     def children(self) -> Iterable[object]:
         """Nothing whose author could be named in an error."""
@@ -62,9 +67,9 @@ class HandedIn:
         yield torch.stack(videos)
 
     def _clip(self, seed: int, actions: NDArray[np.float32]) -> torch.Tensor:
-        for task, own in self._known.get(seed, ()):
+        for task, draw, own in self._known.get(seed, ()):
             if own.shape == actions.shape and np.all(abs(own - actions) <= TOLERANCE * self._span):
-                video = self._predictions.video(task.id)
+                video = self._predictions.video(task.id, draw)
                 return torch.as_tensor(np.ascontiguousarray(video.transpose(0, 3, 1, 2)))
         world = self._predictions.world.name
         raise DataError(

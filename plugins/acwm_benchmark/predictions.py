@@ -34,8 +34,8 @@ class Predictions:
 
     @property
     def draws(self) -> int:
-        """The number of draws of every task."""
-        return len(next(iter(self.files.values())))
+        """The number of draws of every test clip."""
+        return max(map(len, self.files.values()))
 
     @cached_property
     def coding(self) -> Coding | None:
@@ -108,7 +108,7 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
         else:
             found[name][draw] = path
     faults += [f"{name}: its prediction is missing" for name in wanted if name not in found]
-    faults += _of_draws(found)
+    faults += _of_draws(found, wanted)
     _refuse(faults)
     files = {name: [found[name][draw] for draw in sorted(found[name])] for name in wanted}
     return Predictions(folder, world, wanted, files)
@@ -124,12 +124,16 @@ def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:
     return (draw[1], int(draw[2])) if draw and task not in wanted else (task, 0)
 
 
-def _of_draws(found: Mapping[str, Mapping[int, Path]]) -> list[str]:
+def _of_draws(found: Mapping[str, Mapping[int, Path]], tasks: Mapping[str, Task]) -> list[str]:
     most = max((len(each) for each in found.values()), default=0)
-    return [
-        f"{name}: draws {', '.join(map(str, each))} are there, not 0 to {most - 1} as of others"
+    wrong = {
+        name: sorted(each)
         for name, each in found.items()
-        if sorted(each) != list(range(most))
+        if sorted(each) != list(range(most)) and not (tasks[name].branch and [*each] == [0])
+    }
+    return [
+        f"{name}: draws {', '.join(map(str, draws))} are there, not 0 to {most - 1} as of others"
+        for name, draws in wrong.items()
     ]
 
 

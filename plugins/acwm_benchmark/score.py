@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from acwm_benchmark.model import HandedIn
@@ -64,8 +64,6 @@ def score_predictions(
     entry, chosen = read_entry(folder), given.worlds(worlds)
     found = [find_predictions(folder, world, given.of(world.name)) for world in chosen]
     for each in found:
-        if each.draws > 1:
-            raise DataError(f"{folder} holds {each.draws} draws of a task: only one is scored yet")
         each.check()
     home = Path(out) if out else Path("scores", folder.resolve().name)
     place = truth_beside(given.folder) if data is None else Path(data)
@@ -93,7 +91,8 @@ def _score(
     if predictions.coding is not None:
         rows.insert(2, "codec")
     card = next(iter(datasets.values())).card.environment
-    evaluator = evaluator_of(model, card, settings_of(world, tasks), rows)
+    config = with_draws(settings_of(world, tasks), predictions.draws)
+    evaluator = evaluator_of(model, card, config, rows)
     facts = {
         "predictions": str(predictions.folder),
         "tasks": str(tasks.folder),
@@ -121,3 +120,17 @@ def settings_of(world: World, tasks: Tasks) -> EvaluationConfig:
         return EvaluationConfig(**check_section("evaluation", world.evaluation))
     except RecipeError as error:
         raise DataError(f"{origin}: {error}") from error
+
+
+def with_draws(config: EvaluationConfig, draws: int) -> EvaluationConfig:
+    """The settings for so many draws of each clip.
+
+    Raises:
+        DataError: the tasks ask for another number of several.
+    """
+    if draws > 1 and config.samples not in (1, draws):
+        raise DataError(
+            f"there are {draws} draws of each task, but the tasks ask for {config.samples}, or for "
+            "one of a model that draws nothing"
+        )
+    return replace(config, samples=max(draws, config.samples))

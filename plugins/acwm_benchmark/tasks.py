@@ -67,6 +67,7 @@ class Task:
         actions: the NPZ file with ``actions`` `[T, A]`; row i leads from frame i to i + 1, and the
             last one, which leads to no frame, is zero.
         seed: seeds noise if a model has any; equal for all tasks that start from the same clip.
+        branch: whether it starts like a test clip and takes other actions; one draw is enough.
     """
 
     id: str
@@ -76,6 +77,7 @@ class Task:
     images: list[str]
     actions: str
     seed: int
+    branch: bool
 
 
 @dataclass(frozen=True)

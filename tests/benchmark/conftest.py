@@ -49,12 +49,12 @@ def noisy_run(truth, tmp_path_factory):
     return evaluated(tiny.make_run(made, truth / "slide", parts={"env": {"name": "slide"}}), truth)
 
 
-def evaluated(run, truth):
+def evaluated(run, truth, **more):
     from acwm_core.evaluation.evaluate import evaluate_run
 
-    settings = {**FEW, "steps_sweep": "[]", "device": "cpu"}
+    settings = {**FEW, "steps_sweep": "[]", "device": "cpu", **more}
     words = [f"evaluation.{name}={value}" for name, value in settings.items()]
-    evaluate_run(run, data=truth / "slide", overrides=words, progress=False)
+    evaluate_run(run, data=truth / "slide", overrides=words, overwrite=True, progress=False)
     return run
 
 

@@ -7,21 +7,25 @@ import numpy as np
 import torch
 from PIL import Image
 
+from acwm_core.evaluation.clips import draw_seeds
 from acwm_core.training.run import load_run
 
 
-def predict(run, tasks, out, kind):
+def predict(run, tasks, out, kind, draws=1):
+    """Predict all tasks; of branches one draw."""
     model = load_run(run).world_model
     for line in (tasks / "index.jsonl").read_text().splitlines():
         task = json.loads(line)
         images = [np.asarray(Image.open(tasks / name)) for name in task["images"]]
         given = torch.as_tensor(np.stack(images)).permute(0, 3, 1, 2)[None].float() / 255
         actions = torch.as_tensor(np.load(tasks / task["actions"])["actions"])[None]
-        video = model.rollout(given, actions, seeds=[task["seed"]], check=False)
-        assert video.shape[1] == task["frames"]
-        path = out / task["id"]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        WRITERS[kind](path, video[0].permute(0, 2, 3, 1).numpy())
+        number = 1 if task["branch"] else draws
+        for draw, seed in enumerate(draw_seeds(task["seed"], number)):
+            video = model.rollout(given, actions, seeds=[seed], check=False)
+            assert video.shape[1] == task["frames"]
+            path = out / (task["id"] + f".{draw}" * (number > 1))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            WRITERS[kind](path, video[0].permute(0, 2, 3, 1).numpy())
     return out
 
 
@@ -32,12 +36,12 @@ def to_png(path, video):
 
 
 def to_npz(path, video):
-    np.savez(path.with_suffix(".npz"), video=video)
+    np.savez(path.with_name(path.name + ".npz"), video=video)
 
 
 def to_video(container, codec, pixels, **options):
     def write(path, video):
-        with av.open(str(path.with_suffix(container)), "w") as file:
+        with av.open(str(path.with_name(path.name + container)), "w") as file:
             stream = file.add_stream(codec, rate=10, options=options)
             stream.height, stream.width = video.shape[1:3]
             stream.pix_fmt = pixels
@@ -50,7 +54,9 @@ def to_video(container, codec, pixels, **options):
 
 def to_gif(path, video):
     images = [Image.fromarray(image) for image in (video * 255).round().astype(np.uint8)]
-    images[0].save(path.with_suffix(".gif"), save_all=True, append_images=images[1:], duration=100)
+    images[0].save(
+        path.with_name(path.name + ".gif"), save_all=True, append_images=images[1:], duration=100
+    )
 
 
 WRITERS = {

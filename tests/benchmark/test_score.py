@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+import shutil
 
 import pytest
 
 from acwm_benchmark.score import score_predictions
 from acwm_core.evaluation.results import Summary
+from tests.benchmark.conftest import evaluated
 from tests.benchmark.participant import predict
 
 ROWS = {"model", "copy"}
@@ -46,10 +48,9 @@ def assert_same(found, expected, least, tolerance=1e-6):
         assert close, (place, found[place], value)
 
 
-def assert_evaluates_to(scored, run):
-    evaluated = Summary.read(run)
-    assert set(scored.splits["ind_test"].scores.rows) == ROWS
-    assert set(evaluated.splits["ind_test"].scores.rows) == ROWS | {"shuffled", "codec"}
+def assert_evaluates_to(scored, evaluated, rows=ROWS):
+    assert set(scored.splits["ind_test"].scores.rows) == rows
+    assert set(evaluated.splits["ind_test"].scores.rows) == rows | {"shuffled", "codec"}
     assert scored.splits["ind_test"].counterfactual.branches > 10
     assert_same(scored.splits, evaluated.splits, least=300)
     assert_same(scored.gap, evaluated.gap, least=30)
@@ -58,13 +59,24 @@ def assert_evaluates_to(scored, run):
 
 
 def test_pictures_get_the_summary_of_evaluate(scored, run):
-    assert_evaluates_to(scored, run)
+    assert_evaluates_to(scored, Summary.read(run))
 
 
 @pytest.mark.ci
 def test_a_model_with_noise_gets_the_summary_of_evaluate(noisy_run, tasks, truth, tmp_path):
     predictions = predict(noisy_run, tasks, tmp_path / "noisy", "npz")
-    assert_evaluates_to(score(predictions, tasks, truth, tmp_path / "scores"), noisy_run)
+    found = score(predictions, tasks, truth, tmp_path / "scores")
+    assert_evaluates_to(found, Summary.read(noisy_run))
+
+
+@pytest.mark.ci
+def test_draws_get_the_summary_of_evaluate(noisy_run, tasks, truth, tmp_path):
+    predictions = predict(noisy_run, tasks, tmp_path / "noisy", "npz", draws=3)
+    found = score(predictions, tasks, truth, tmp_path / "scores")
+    run = evaluated(shutil.copytree(noisy_run, tmp_path / "run"), truth, samples=3)
+    drawn = ROWS | {"mean_of_draws", "best_of_draws"}
+    assert_evaluates_to(found, Summary.read(run), drawn)
+    assert found.provenance["draws"] == 3
 
 
 def rms(summary, split, row):
