@@ -180,7 +180,7 @@ def test_a_run_is_not_overwritten(latest, tmp_path):
         import_checkpoint(path, tmp_path / "run", WORDS)
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "models.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "paper.md"
 
 
 @pytest.mark.ci

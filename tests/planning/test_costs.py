@@ -114,9 +114,9 @@ def code(document, name):
 
 
 def test_what_the_documents_show_works():
-    cost = code("docs/plugins.md", "LastDistance")()
+    cost = code("docs/reference/planning.md", "LastDistance")()
     assert cost(Known(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(math.hypot(3, 3)), 0]
-    planner = code("docs/plugins.md", "HillClimbing")(candidates=300, horizon=2)
+    planner = code("docs/reference/planning.md", "HillClimbing")(candidates=300, horizon=2)
     plan = planned(planner, quadratic(torch.tensor([0.5, 0.4])))
     assert plan.evaluations == 300
     torch.testing.assert_close(
