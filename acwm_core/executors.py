@@ -41,6 +41,13 @@ LINE_EVERY_S = 10.0  # seconds between progress lines if there is no terminal
 POLL = 0.2  # seconds between checks of the workers' progress
 
 
+def duration(seconds: float) -> str:
+    """A time in words: ``45 s``, ``12 min``, ``3.4 h``."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5970 else f"{seconds / 3600:.1f} h"
+
+
 @contextlib.contextmanager
 def progress_bar(
     what: str,
@@ -85,7 +92,9 @@ def progress_bar(
         def print_line() -> None:
             made = int(bar.tasks[0].completed)
             of = made if total is None else f"{made}/{total}"
-            line = f"{what}  {of} {unit}  {text_now()}"
+            left = bar.tasks[0].time_remaining
+            until = f"  {duration(left)} left" if left else ""
+            line = f"{what}  {of} {unit}  {text_now()}{until}"
             console.print(line.rstrip(), highlight=False, soft_wrap=True)
 
         def report(units: int) -> None:

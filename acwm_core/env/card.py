@@ -12,7 +12,7 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.episode import Episode, Factor
+from acwm_core.env.episode import Episode, Factor, plain_unit
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import ShapeError, expect
 
@@ -44,6 +44,7 @@ class ActionSpec:
     kind: ActionKind
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "units", tuple(map(plain_unit, self.units)))
         lengths = {len(self.names), len(self.units), len(self.low), len(self.high)}
         if len(lengths) != 1:
             raise ShapeError("an ActionSpec needs a name, a unit, a low and a high per dimension")
@@ -75,6 +76,9 @@ class StateField:
     shape: tuple[int, ...]
     unit: str
     description: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", plain_unit(self.unit))
 
 
 @dataclass(frozen=True)

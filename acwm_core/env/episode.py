@@ -30,6 +30,11 @@ FactorSetting = FactorValue
 REGIONS = ("train", "ood", "nominal")
 
 
+def plain_unit(unit: str) -> str:
+    """A unit as it is shown: nothing for pure numbers, whose unit in SI is ``"1"``."""
+    return "" if unit == "1" else unit
+
+
 @dataclass(frozen=True)
 class Factor:
     """One factor of variation of an environment, with its train and out-of-distribution ranges.
@@ -56,6 +61,9 @@ class Factor:
     ood: tuple[Any, ...]
     unit: str = ""
     active: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", plain_unit(self.unit))
 
     @classmethod
     def continuous(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import Environment, Policy
+from acwm_core.env.episode import plain_unit
 from acwm_core.env.physics import Observation
 from acwm_core.errors import PluginError, RecipeError, check_shape
 
@@ -77,6 +78,11 @@ class Task(ABC):
     max_steps: int
     avoid: tuple[tuple[str, str], ...] = ()
     planning: tuple[str, ...] = ()
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "unit" in vars(cls):
+            cls.unit = plain_unit(cls.unit)
 
     @abstractmethod
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:

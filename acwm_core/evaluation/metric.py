@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.episode import Episode
+from acwm_core.env.episode import Episode, plain_unit
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import PluginError, ShapeError, check_shape, noting
 from acwm_core.evaluation.clips import Clip, Predictor, as_clip
@@ -176,6 +176,9 @@ class MetricInfo:
     rank: int = 100
     definition: int = 1
     right: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", plain_unit(self.unit))
 
 
 class Metric(ABC):

@@ -87,6 +87,8 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for section in SECTIONS:
         values[section] = check_section(section, values[section])
     values["trainer"] = _ordered_flags(values["trainer"])
+    together = resolve_name("acwm_core.training.config:check_together")
+    together(values["training"], values["trainer"])
     for config in _metrics(values["evaluation"]).values():
         catalog().component("metric", config.component.partition(".")[0])
     return values

@@ -62,6 +62,18 @@ def read_details(path: Path) -> dict[str, Any]:
     return _load(path / META if path.is_dir() else path, mmap=True)
 
 
+def read_step(path: Path) -> int:
+    """The number of optimiser steps behind a checkpoint.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
+    step = read_details(path).get("global_step")
+    if not isinstance(step, int) or step < 0:
+        raise _damaged(path, ValueError(f"its global_step is {step!r}"))
+    return step
+
+
 def read_whole(path: Path) -> dict[str, Any]:
     """Read a checkpoint of either kind, in the form of Lightning's single files, on the CPU."""
     return _load(path) if path.is_file() else _read_folder(path)
@@ -70,9 +82,12 @@ def read_whole(path: Path) -> dict[str, Any]:
 def _load(file: Path, *, mmap: bool = False) -> dict[str, Any]:
     """The dict in a file of `torch.save`, read without executing anything in it."""
     try:
-        return torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
+        found = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError) as error:
         raise _damaged(file, error) from error
+    if not isinstance(found, dict):
+        raise _damaged(file, TypeError(f"it holds a {type(found).__name__}"))
+    return cast(dict[str, Any], found)
 
 
 def _damaged(path: Path, error: BaseException) -> TrainingError:

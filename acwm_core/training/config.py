@@ -39,6 +39,19 @@ def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
     return [each for each in listed if not isinstance(each, bool | None)]
 
 
+def check_together(training: Mapping[str, Any], trainer: Mapping[str, Any]) -> None:
+    """Check what the sections `training` and `trainer` say together.
+
+    Raises:
+        RecipeError: the optimiser does not work with the strategy.
+    """
+    if training.get("optimizer") == "muon" and trainer.get("strategy") == "fsdp":
+        raise RecipeError(
+            "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp shards them: "
+            "set training.optimizer=adamw or trainer.strategy=ddp"
+        )
+
+
 @dataclass(frozen=True)
 class TrainingConfig:
     """The recipe's section `training`: optimiser, schedule, validation, checkpoints and samples.

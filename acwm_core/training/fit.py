@@ -23,7 +23,7 @@ from acwm_core.model.build import build_world_model
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training import callbacks
-from acwm_core.training.checkpoints import read_details
+from acwm_core.training.checkpoints import read_step
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data import ClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
@@ -73,7 +73,7 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         episodes = EpisodeDataset(recipe.data["path"], "train")
         _check_environment(recipe, episodes.card)
         checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
-        first_step = read_details(checkpoint)["global_step"] if checkpoint else 0
+        first_step = read_step(checkpoint) if checkpoint else 0
         if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
             loggers = build_loggers(run, recipe.trainer, first_step)
             with tracking(loggers, run) as continued:

@@ -145,11 +145,6 @@ class TrainingModule(L.LightningModule):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning-rate schedule that is updated every step."""
         config, max_steps = self.config, self.trainer.max_steps
-        if self.is_sharded and config.optimizer == "muon":
-            raise TrainingError(
-                "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp shards "
-                "them: set training.optimizer=adamw or trainer.strategy=ddp"
-            )
         # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
         fused = self.trainer.precision != "16-mixed"
         optimizer = build_optimizer(self.world_model, config, fused=fused)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import huggingface_hub
 from diffusers.configuration_utils import ConfigMixin
@@ -27,7 +27,12 @@ SUBFOLDER = "vae"
 Autoencoder = TypeVar("Autoencoder", bound=ModelMixin)
 
 
-def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoencoder:
+def load_autoencoder(
+    kind: type[Autoencoder],
+    weights: str,
+    codec: str,
+    check: Callable[[Mapping[str, Any]], None] = lambda configuration: None,
+) -> Autoencoder:
     """Load a float32 autoencoder from a folder, or from a Hub repository if no such folder exists.
 
     Args:
@@ -35,18 +40,25 @@ def load_autoencoder(kind: type[Autoencoder], weights: str, codec: str) -> Autoe
         weights: folder with `CONFIGURATION` and `TENSORS`, directly or in `SUBFOLDER`; or the id of
             a Hub repository with that subfolder.
         codec: name of the codec for messages.
+        check: refuses configurations, before any weights are fetched or read.
 
     Raises:
         DataError: it does not exist, cannot be reached, or does not hold such an autoencoder.
     """
     local = Path(weights)
-    folder = _inside(local, codec) if local.exists() else _downloaded(weights, codec)
+    folder = _inside(local, codec) if local.exists() else _downloaded(weights, CONFIGURATION, codec)
     try:
         configuration: Any = parse_json((folder / CONFIGURATION).read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None
+    if isinstance(configuration, dict):
+        check(cast(dict[str, Any], configuration))
+    autoencoder = build(kind, configuration, folder / CONFIGURATION, codec)
+    folder = folder if local.exists() else _downloaded(weights, TENSORS, codec)
+    try:
         state = load_file(folder / TENSORS)
     except (OSError, ValueError, SafetensorError) as error:
         raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None
-    autoencoder = build(kind, configuration, folder / CONFIGURATION, codec)
     load_strictly(autoencoder, state, folder / TENSORS, codec)
     return autoencoder
 
@@ -126,11 +138,10 @@ def _inside(folder: Path, codec: str) -> Path:
     raise DataError(f"codec {codec!r}: {folder} is not a folder with {CONFIGURATION} and {TENSORS}")
 
 
-def _downloaded(repository: str, codec: str) -> Path:
-    """The folder of a repository's autoencoder in the local cache; downloads missing files."""
+def _downloaded(repository: str, name: str, codec: str) -> Path:
+    """The folder of a repository's autoencoder in the local cache; downloads a missing file."""
     try:
-        for name in (CONFIGURATION, TENSORS):
-            found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
+        found = huggingface_hub.hf_hub_download(repository, name, subfolder=SUBFOLDER)
     except Exception as error:  # the HTTP library raises many kinds of errors
         if full := disk_error(error):
             where = f"the Hub's cache cannot be written ({full.strerror})"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
@@ -19,6 +22,8 @@ from acwm_core.model.shapes import Latent, Video
 
 HUB = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
 """The default repository; its folder `vae` is used."""
+
+WAN_2_2_CHANNELS = 48
 
 
 class Wan(Codec):
@@ -46,7 +51,7 @@ class Wan(Codec):
         self.autoencoder = load(weights, self.name).requires_grad_(False)
         configuration = self.autoencoder.config
         self.channels = configuration["z_dim"]
-        self.spatial_stride = self._spatial_stride()
+        self.spatial_stride = 2 ** (len(configuration["dim_mult"]) - 1)
         self.register_buffer("mean", self._statistics("latents_mean"), persistent=False)
         self.register_buffer("deviation", self._statistics("latents_std"), persistent=False)
         self.eval()
@@ -102,16 +107,6 @@ class Wan(Codec):
             )
         return torch.tensor(given, dtype=torch.float32).view(-1, 1, 1)
 
-    def _spatial_stride(self) -> int:
-        """The spatial stride of the architecture; refuses Wan 2.2, which has other strides."""
-        configuration = self.autoencoder.config
-        if sum(configuration["temperal_downsample"]) != 2 or configuration["patch_size"]:
-            raise DataError(
-                f"codec {self.name!r} is the autoencoder of Wan 2.1, which halves time twice and "
-                "takes no patches; these weights are of another one"
-            )
-        return 2 ** (len(configuration["dim_mult"]) - 1)
-
 
 class WanPerFrame(Wan):
     """The same autoencoder with every frame encoded by itself: strides 8×8, 16 channels.
@@ -140,7 +135,22 @@ def _as_clips(frames: Tensor) -> Tensor:
 
 
 def _load_folder(weights: str, codec: str) -> AutoencoderKLWan:
-    return load_autoencoder(AutoencoderKLWan, weights, codec)
+    def check(configuration: Mapping[str, Any]) -> None:
+        halves = configuration.get("temperal_downsample", [False, True, True])
+        patches = bool(configuration.get("patch_size"))
+        if patches or (isinstance(halves, list) and halves.count(True) != 2):
+            raise _another(codec, weights, version=patches)
+
+    return load_autoencoder(AutoencoderKLWan, weights, codec, check)
+
+
+def _another(codec: str, weights: str, *, version: bool) -> DataError:
+    """The error for weights of Wan 2.2 (`version`), which cuts frames into patches, or others."""
+    found = "Wan 2.2, which has 48 channels and strides 16×16×4" if version else "another model"
+    return DataError(
+        f"codec {codec!r} is the autoencoder of Wan 2.1, and {weights} holds that of {found}: "
+        f"leave out codec.weights, or set it to one of Wan 2.1 such as {HUB}"
+    )
 
 
 def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
@@ -148,6 +158,8 @@ def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
     path = Path(weights)
     try:
         state = _read_tensors(path)
+        if len(state.get("conv2.weight", ())) == WAN_2_2_CHANNELS:
+            raise _another(codec, weights, version=True)
         widths = {
             "base_dim": len(state["encoder.conv1.weight"]),
             "z_dim": len(state["conv2.weight"]),
@@ -170,7 +182,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
     """Read tensors by name; code in a pickle is never run."""
     if path.suffix == ".safetensors":
         return load_file(path)
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
         raise ValueError("it is not a dictionary of tensors")
     return state

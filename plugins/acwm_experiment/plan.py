@@ -11,6 +11,7 @@ from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import find_recipe, recipe_folder
 from acwm_experiment.files import DataChoice, ExperimentFile, slug
 from acwm_experiment.logs import StepLogs
+from acwm_experiment.names import run_names
 from acwm_experiment.runs import DatasetSpec, RunSpec
 from acwm_experiment.table import Experiment, ExperimentCell
 from acwm_experiment.tasks import PlanCommand, plan_commands
@@ -51,13 +52,14 @@ def make_plan(file: ExperimentFile, folder: Path, runs: Path | None = None) -> E
     """
     parent, experiment = runs or folder / "runs", file.experiment
     composed = [_composed(file, cell) for cell in experiment.cells]
+    names = run_names(file.overrides, experiment.cells)
     cells = tuple(
         replace(
             cell,
             overrides=(*file.overrides, *cell.overrides),
-            runs=tuple(parent / f"{_name(file, cell)}-{seed}" for seed in experiment.seeds),
+            runs=tuple(_folder(parent, file, cell, name, seed) for seed in experiment.seeds),
         )
-        for cell in experiment.cells
+        for cell, name in zip(experiment.cells, names, strict=True)
     )
     found: dict[Path, RunSpec] = {}
     for place, seed in enumerate(experiment.seeds):
@@ -114,8 +116,13 @@ def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> Data
     return None
 
 
-def _name(file: ExperimentFile, cell: ExperimentCell) -> str:
-    """Name of a cell's runs, such as ``push_cube+small``, with the cell's own overrides."""
+def _folder(parent: Path, file: ExperimentFile, cell: ExperimentCell, name: str, seed: int) -> Path:
+    """The run folder of a cell; an older one keeps its name."""
+    before = parent / f"{_former_name(file, cell)}-{seed}"
+    return before if before.is_dir() else parent / f"{name}-{seed}"
+
+
+def _former_name(file: ExperimentFile, cell: ExperimentCell) -> str:
     overrides = [*file.overrides, *cell.overrides]
     overlays = "".join(dict.fromkeys(each for each in overrides if each.startswith("+")))
     others = [override for override in cell.overrides if not override.startswith("+")]

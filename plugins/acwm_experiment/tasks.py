@@ -12,6 +12,7 @@ from acwm_core.errors import AcwmError, RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_core.training.run_folder import copy_of, find_run, trained_models
 from acwm_experiment.files import TaskChoice, slug
+from acwm_experiment.names import safe
 from acwm_experiment.runs import RunSpec
 from acwm_experiment.table import Experiment
 from acwm_planning.jobs import PLANS, PlanningJob
@@ -115,8 +116,10 @@ def _plan_command(choice: TaskChoice, model: _Model, folder: Path) -> PlanComman
     rows = settings.rows(choice.rows)
     if not rows:
         raise RecipeError(f"rows={[*choice.rows]}: give one that can be played, such as model")
-    name = slug(",".join([f"{Path(model.name).name}-{choice.task}", *choice.overrides]))
-    usual = model.results / PLANS / choice.task
+    words = [f"{Path(model.name).name}-{choice.task}", *choice.overrides]
+    name, former = safe("-".join(words)), slug(",".join(words))
+    usual, own = model.results / PLANS / choice.task, folder / PLANS
+    own /= former if (own / former).is_dir() else name
     job = PlanningJob(
         table=choice.table,
         row=model.label,
@@ -126,12 +129,12 @@ def _plan_command(choice: TaskChoice, model: _Model, folder: Path) -> PlanComman
         settings=json.loads(json.dumps(settings.to_dict())),  # as it is read again
         rows=tuple(rows),
         seeds=choice.seeds,
-        folder=folder / PLANS / name if choice.overrides else usual,
+        folder=own if choice.overrides else usual,
     )
-    words = [model.name, choice.task, *choice.overrides, "--seeds", _numbers(choice.seeds)]
-    words += [word for row in rows for word in ("--row", row)]
-    words += ["--videos", str(choice.videos), "--out", str(job.folder)]
-    return PlanCommand(name, job, tuple(words), model.run)
+    typed = [model.name, choice.task, *choice.overrides, "--seeds", _numbers(choice.seeds)]
+    typed += [word for row in rows for word in ("--row", row)]
+    typed += ["--videos", str(choice.videos), "--out", str(job.folder)]
+    return PlanCommand(name, job, tuple(typed), model.run)
 
 
 def _numbers(seeds: Sequence[int]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from collections.abc import Mapping
 from fractions import Fraction
@@ -14,7 +15,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.env.card import plain_rate
 from acwm_core.env.environment import ActionSpec, StateField
 from acwm_core.env.episode import SPLITS, Split
-from acwm_core.errors import DataError, suggest
+from acwm_core.errors import AcwmError, DataError, suggest
+from acwm_core.files import disk_error
 from acwm_formats.alignment import Alignment
 from acwm_formats.reading import ImportOptions
 from acwm_formats.recordings import import_dataset
@@ -88,7 +90,13 @@ def write_dataset(
         summary=summary,
     )
     options = ImportOptions(size=size, alignment=alignment or Alignment())
-    made = import_dataset(recorded, out, options, workers=workers, progress=progress)
+    is_new = not Path(out).exists()
+    try:
+        made = import_dataset(recorded, out, options, workers=workers, progress=progress)
+    except AcwmError as error:
+        if is_new and not disk_error(error):  # what was decoded before the disk was full is kept
+            shutil.rmtree(out, ignore_errors=True)
+        raise
     if progress:
         print(*short_form(survey(out)), sep="\n", file=sys.stderr)
     return made

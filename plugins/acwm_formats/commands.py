@@ -82,7 +82,10 @@ def _print_facts(facts: dict[str, Any]) -> None:
 
     height, width = facts["frame_size"]
     click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
-    click.echo(f"{height}×{width} at {facts['fps']:.6g} fps, {facts['horizon']} frames per episode")
+    lengths = [n for each in facts["splits"].values() for n in each["lengths"]]
+    low, high = (min(lengths), max(lengths)) if lengths else (facts["horizon"],) * 2
+    long = f"{low}" if low == high else f"{low} to {high}"
+    click.echo(f"{height}×{width} at {facts['fps']:.6g} fps, {long} frames per episode")
     if facts["source"]:
         click.echo(f"recorded: {facts['source']['name']} ({facts['source']['kind']})")
         _print_notes(facts["source"])

@@ -174,8 +174,13 @@ class Take:
         Raises:
             DataError: there is no second frame, or frames are of several sizes.
         """
-        if len({image.shape for image in self.images}) > 1:
-            raise DataError("its render() returns frames of several sizes")
+        shapes = [image.shape[:2] for image in self.images]
+        if other := next((shape for shape in shapes if shape != shapes[0]), None):
+            first, then = ("×".join(map(str, shape)) for shape in (shapes[0], other))
+            raise DataError(
+                f"its render() returns frames of {first} first and of {then} in frame "
+                f"{shapes.index(other)}: wrap it in one that renders one size"
+            )
         vectors = isinstance(space, Box) and len(space.shape) == 1
         states = {OBSERVATION: np.stack(self.seen)} if vectors else {}
         if not self.taken:

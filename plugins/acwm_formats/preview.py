@@ -37,8 +37,9 @@ def describe(path: str | Path) -> dict[str, Any]:
     Returns:
         The card's `environment` (name), `summary`, `frame_size`, `fps`, `horizon`, `seed`,
         `factors`, `versions`, `source` (of recorded data), and `splits`, which has for each split:
-        `episodes` (requested), `made`, `shards`, `frames`, `bytes`, `actions` (statistics, once
-        finished) and, for a simulated `ood_test`, the number of episodes with each `ood_label`.
+        `episodes` (requested), `made`, `shards`, `frames`, `lengths` (shortest and longest),
+        `bytes`, `actions` (statistics, once finished) and, for a simulated `ood_test`, the number
+        of episodes with each `ood_label`.
 
     Raises:
         DataError: there is no dataset, or it is damaged.
@@ -102,11 +103,13 @@ def preview(
 
 def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, Any]:
     records = Manifest(path / split, card.splits[split]).ordered()
+    lengths = [length for record in records for length in record.lengths]
     facts: dict[str, Any] = {
         "episodes": card.splits[split],
         "made": sum(record.episodes for record in records),
         "shards": len(records),
-        "frames": sum(record.frames for record in records),
+        "frames": sum(lengths),
+        "lengths": [min(lengths), max(lengths)] if lengths else [],
         "bytes": sum(record.size for record in records),
         "actions": dict(card.actions.get(split, {})),
     }

@@ -12,6 +12,7 @@ from acwm_core.cli.arguments import OUT_FOLDER, RUN, seeds_of
 
 if TYPE_CHECKING:
     from acwm_planning.resumable import Line
+    from acwm_planning.settings import Settings
     from acwm_planning.table import RowSummary
 
 
@@ -32,6 +33,12 @@ if TYPE_CHECKING:
     "--preset", default="default", help="Settings that OVERRIDES change: stable_worldmodel."
 )
 @click.option("--videos", default=3, help="Number of episodes to write videos of.")
+@click.option(
+    "--landscape",
+    is_flag=True,
+    help="Only draw, for each episode, the cost over a grid of two actions around those of the "
+    "scripted solution, in the simulator and in the model.",
+)
 @click.option("--device", default="auto", help="Device of the model: cpu, cuda, cuda:1, …")
 def plan(
     run: Path,
@@ -43,6 +50,7 @@ def plan(
     rows: tuple[str, ...],
     preset: str,
     videos: int,
+    landscape: bool,
     device: str,
 ) -> None:
     """Act in TASK by planning with the model of RUN.
@@ -66,12 +74,15 @@ def plan(
     click.echo(f"settings: {' '.join(effective)}")
     if other := [word for word in declared if word not in effective]:
         click.echo(f"not as the task declares: {' '.join(other)}")
+    where = out or run / "planning" / task
+    if landscape:
+        draw_landscapes(run, task, settings, seeds, where, device)
+        return
     if compare and settings.differentiates and not rows:
         click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
         rows = tuple(row for row in ROW_NAMES if row not in ("simulator", "codec"))
     chosen = settings.rows(rows or (ROW_NAMES if compare else ("model",)))
 
-    where = out or run / "planning" / task
     with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:
 
         def report(line: Line) -> None:
@@ -89,13 +100,44 @@ def plan(
             videos=videos,
             device=device,
             report=report,
+            tell=lambda text: click.echo(text, err=True),
         )
     print_table(table)
     click.echo(where)
 
 
+def draw_landscapes(
+    run: Path, task: str, settings: Settings, seeds: Sequence[int], out: Path, device: str
+) -> None:
+    """Draw the cost landscape of each episode, and print where the true action is in it."""
+    from acwm_core.training.run import load_run
+    from acwm_planning.landscape import draw, landscape
+    from acwm_planning.left_out import LeftOut
+    from acwm_planning.run import EpisodePlayer, usual_actions
+
+    player, left, drawn = (
+        EpisodePlayer(load_run(run), task, settings, device, usual_actions(run)),
+        LeftOut(),
+        0,
+    )
+    try:
+        for seed in seeds:
+            with left.trying("the landscape", seed):
+                found = landscape(player, seed)
+                path = draw(found, player.card.action, out / f"landscape-{seed:04d}.png")
+                shares = ", ".join(
+                    f"{rank:.1%} in the {each}" for each, rank in found.ranks.items()
+                )
+                click.echo(f"{path}: cheaper than the true action are {shares}")
+                drawn += 1
+        if left.error and not drawn:
+            raise left.error
+    finally:
+        player.close()
+
+
 def print_table(table: Sequence[RowSummary]) -> None:
-    """Print a line per row."""
+    """Print a line per row, in at most 80 columns, and what the columns are."""
     from rich.console import Console
     from rich.table import Table
 
@@ -103,7 +145,12 @@ def print_table(table: Sequence[RowSummary]) -> None:
 
     grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for head in HEADS:
-        grid.add_column(head, justify="left" if not head else "right", overflow="fold")
+        narrow = head.replace(" / ", " /\n")
+        grid.add_column(narrow, justify="right" if head else "left", overflow="fold")
     for row in table:
         grid.add_row(*row.cells())
     Console(highlight=False, markup=False).print(grid)
+    click.echo(
+        "95 %: exact interval of the success; p: of McNemar's test against the first row;\n"
+        "final distance: mean in the end, of that at the start"
+    )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import warnings
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acwm_core.errors import DataError
-from acwm_core.files import held, parse_json, writing, written_whole
+from acwm_core.errors import AcwmWarning, DataError
+from acwm_core.files import held, parse_json, read_json, typed, writing, written_whole
 
 EPISODES_FILE, SETTINGS_FILE = "episodes.jsonl", "settings.json"
 """Files in the folder."""
@@ -26,6 +27,7 @@ class ResumableResults:
     folder: Path  # created if missing
     settings: Mapping[str, Any]  # everything that determines the results
     keys: tuple[str, str] = ("row", "seed")  # the keys of a line that identify its episode
+    kind: Any = dict[str, Any]  # a dataclass with the types of a line's entries, or several
 
     def __post_init__(self) -> None:
         settings, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS_FILE
@@ -35,7 +37,7 @@ class ResumableResults:
                 if not path.exists():
                     with written_whole(path) as partial:
                         partial.write_text(json.dumps(settings, indent=1), encoding="utf-8")
-        stored: dict[str, Any] = parse_json(path.read_text(encoding="utf-8"))
+        stored = read_json(path, dict[str, Any], "settings of results")
         differences = sorted(
             name for name in {*settings, *stored} if settings.get(name) != stored.get(name)
         )
@@ -46,14 +48,23 @@ class ResumableResults:
             )
 
     def finished(self) -> list[Line]:
-        """The results of all finished episodes, without lines that were only partly written."""
-        path, lines = self.folder / EPISODES_FILE, dict[tuple[str, int], Line]()
-        for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        """The results of all finished episodes.
+
+        Lines that are damaged are told and left out, so that their episodes are played again, as
+        are those of lines that a killed command wrote only in part.
+        """
+        path, lines, damaged = self.folder / EPISODES_FILE, dict[tuple[str, int], Line](), 0
+        content = path.read_bytes() if path.exists() else b""
+        for text in content.split(b"\n"):
             try:
                 line: dict[str, Any] = parse_json(text)
+                typed(line, self.kind)
                 lines[str(line[self.keys[0]]), int(line[self.keys[1]])] = line
-            except (ValueError, KeyError, TypeError, DataError):
-                continue
+            except (ValueError, LookupError, TypeError):
+                damaged += text.endswith((b"}", b"]"))
+        if damaged:
+            told = f"{path} has damaged lines ({damaged}): their episodes are played again"
+            warnings.warn(told, AcwmWarning, stacklevel=2)
         return list(lines.values())
 
     @contextlib.contextmanager

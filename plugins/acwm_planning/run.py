@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,9 +13,10 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.task import Task, TaskEnvironment
+from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
+from acwm_core.executors import duration
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder, find_run
@@ -25,15 +28,24 @@ from acwm_planning.controllers import (
     StillController,
 )
 from acwm_planning.episode import EpisodeResult, TaskVariant, play, spec_of_seed
-from acwm_planning.futures import ModelRollouts
+from acwm_planning.futures import History, ModelRollouts
 from acwm_planning.left_out import LeftOut
 from acwm_planning.page import write_page
 from acwm_planning.planner import Cost, Planner
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import VIDEOS, RowSummary, missing_episodes, summarise, write_summary
+from acwm_planning.table import (
+    VIDEOS,
+    EpisodeLine,
+    RowSummary,
+    missing_episodes,
+    summarise,
+    write_summary,
+)
 from acwm_planning.video import draw_curves, imagine, write_episode
+
+PLANNED_ROWS = ("model", "simulator", "codec")
 
 
 class EpisodePlayer:
@@ -86,6 +98,25 @@ class EpisodePlayer:
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
         return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
+
+    def estimate(self, episodes: Sequence[tuple[str, int]]) -> str:
+        """How long it takes at most to play these, rows and seeds, from a decision of each planner.
+
+        Episodes that are solved end earlier, and those without a planner take little.
+        """
+        counts = Counter(row for row, _ in episodes if row in PLANNED_ROWS)
+        spec, seconds = spec_of_seed(self.card, episodes[0][1]), 0.0
+        for row, count in counts.items():
+            controller = self.controller(row)
+            assert isinstance(controller, PlanningController)
+            with contextlib.suppress(SolvedAtStartError):
+                frame, _ = self.environment.reset(options={"spec": spec})
+                parts = self.environment.environment, self.environment.task
+                controller.begin(*parts, self.environment.goal)
+                taken = len(controller.act(History(spec, [frame])))
+                decisions = -(-self.environment.task.max_steps // taken)
+                seconds += count * decisions * controller.decisions[0].seconds
+        return f"at most about {duration(seconds)} for {len(episodes)} episodes"
 
     def write_video(
         self, folder: Path, row: str, seed: int, result: EpisodeResult, controller: Controller
@@ -157,6 +188,7 @@ def plan_episodes(
     videos: int = 3,
     device: str = "auto",
     report: Callable[[Line], None] = lambda line: None,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> list[RowSummary]:
     """Play the episodes that are missing in `out`, and write the table of all episodes.
 
@@ -170,6 +202,7 @@ def plan_episodes(
         videos: number of seeds, from the first, that get a video.
         device: device of the model.
         report: called with the result of every episode.
+        tell: called with an estimate of how long it takes, before it starts.
 
     Returns:
         The table of all episodes in `out`.
@@ -184,11 +217,14 @@ def plan_episodes(
         "tolerance": goal_task.tolerance,
         "file_sha256": file_sha256(weights),
     }
-    results = ResumableResults(out, {**identity, **settings.to_dict()})
+    results = ResumableResults(out, {**identity, **settings.to_dict()}, kind=EpisodeLine)
     left = LeftOut()
     try:
         with results.adding():
-            for row, seed in missing_episodes(rows, seeds, results.finished()):
+            missing = [*missing_episodes(rows, seeds, results.finished())]
+            if len(missing) > 1:
+                tell(player.estimate(missing))
+            for row, seed in missing:
                 if row in left.rows or seed in left.solved:
                     continue
                 with left.trying(row, seed):

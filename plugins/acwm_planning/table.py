@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from acwm_core.evaluation.statistics import CONFIDENCE, Estimate, with_interval
+from acwm_core.evaluation.statistics import CONFIDENCE, Estimate, with_interval, within
 from acwm_core.files import writing, written_whole
 from acwm_planning.jobs import PLAN_SUMMARY
 from acwm_planning.resumable import Line
@@ -27,6 +28,21 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
     with writing(path), written_whole(path) as partial:
         partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
     return path
+
+
+@dataclass(frozen=True)
+class EpisodeLine:
+    """A finished episode, as `acwm plan` writes it."""
+
+    row: str
+    seed: int
+    success: bool
+    failed: bool
+    steps: int
+    start_distance: float
+    distance: float
+    seconds_per_decision: float | None = None
+    rollouts_per_decision: float | None = None
 
 
 HEADS = ("", "success", "95 %", "p", "final distance", "s / decision", "rollouts / decision")
@@ -88,7 +104,7 @@ def _row(row: str, by_seed: Mapping[int, Line], first: Mapping[int, Line]) -> Ro
         successes=successes,
         success=Estimate(successes / len(lines), float(interval.low), float(interval.high)),
         failures=sum(bool(line["failed"]) for line in lines),
-        distance=with_interval(float(distances.mean()), [distances]),
+        distance=within(with_interval(float(distances.mean()), [distances]), (0.0, math.inf)),
         start_distance=float(np.mean([line["start_distance"] for line in lines])),
         p=None if by_seed is first else mcnemar(first, by_seed),
         seconds_per_decision=mean("seconds_per_decision"),

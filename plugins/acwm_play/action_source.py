@@ -95,9 +95,10 @@ class ActionSource:
             anew, self._restart_policy = self._restart_policy, False
             return await live.act_by_policy(anew)
         pointing = live.simulator.pointing
-        if self._places is not None and pointing is not None:
+        size = live.simulator.card.action.size
+        if self._places is not None and pointing is not None and self._places.size == size:
             return await live.act(pointing.action(self._places))
-        if self._values is not None and len(self._values) == len(live.controls):
+        if self._values is not None and len(self._values) == size:
             return await live.act(np.array(self._values, np.float32))
         return await live.act(await live.simulator.still())
 

@@ -168,7 +168,10 @@ class RecurrentModel(Predictor):
 
     def _read(self, grid: Tensor) -> Tensor:
         grid = grid.contiguous(memory_format=torch.channels_last)
-        cells = self.out(functional.silu(self.head(channel_norm(grid))))
+        # As a matrix, a 1×1 kernel has gradients of its own strides, as DDP's buckets want them.
+        kernel = self.out.weight.flatten(1)[..., None, None]
+        read = functional.silu(self.head(channel_norm(grid)))
+        cells = functional.conv2d(read, kernel, self.out.bias)
         return functional.pixel_shuffle(cells, self.patch_size)
 
     def actions(self, conditioning: Conditioning) -> Tensor:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 
 from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.evaluation.results import Counterfactual, Summary
 from acwm_report.figures import Chart, Curve, Numbers
+from acwm_report.metrics_file import logged
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import Scale
 from acwm_report.titles import ROWS, split_title
@@ -138,29 +136,16 @@ def predictability_charts(run: EvaluatedRun) -> list[Chart]:
 
 def training_charts(run: EvaluatedRun) -> list[Chart]:
     """The training loss (raw and smoothed) and the validation loss, if there is a log."""
-    steps, losses = _logged(run.folder, "train/loss")
+    steps, losses = logged(run.folder, "train/loss")
     curves = [
         Curve("", "model", steps, losses, "raw"),
         Curve("training", "model", steps, smooth(losses)),
-        Curve("held-out episodes", "shuffled", *_logged(run.folder, "val/loss")),
+        Curve("held-out episodes", "shuffled", *logged(run.folder, "val/loss")),
     ]
     curves = [curve for curve in curves if len(curve.x) > 1]
     if not curves:
         return []
     return [Chart("Loss", f"{run.key}-training", curves, "optimiser steps", "loss", log_y=True)]
-
-
-def _logged(run: Path, column: str) -> tuple[list[float], list[float]]:
-    file = run / "metrics.csv"
-    if not file.exists():
-        return [], []
-    with file.open(newline="", encoding="utf-8") as opened:
-        rows = [row for row in csv.DictReader(opened) if row.get(column)]
-    pairs: list[tuple[float, float]] = []
-    for row in rows:
-        with contextlib.suppress(ValueError, TypeError):  # skip a row that was cut off
-            pairs.append((float(row["step"]), float(row[column])))
-    return [step for step, _ in pairs], [value for _, value in pairs]
 
 
 def smooth(values: list[float]) -> list[float]:

@@ -74,6 +74,7 @@ def _fit(recipe: Recipe, run: Path) -> bool:
     from acwm_core.training.fit import fit
     from acwm_core.training.run import read_metadata
     from acwm_core.training.run_folder import RunFolder
+    from acwm_core.training.signals import StoppedEarly
 
     folder = RunFolder(run)
     finished = recipe.trainer["max_steps"]
@@ -81,7 +82,12 @@ def _fit(recipe: Recipe, run: Path) -> bool:
         return False
     if run.exists() and not folder.last_checkpoint.exists():  # stopped too early to resume
         shutil.rmtree(run)
-    fit(recipe, run, resume=run if run.exists() else None)
+    try:
+        fit(recipe, run, resume=run if run.exists() else None)
+    except StoppedEarly as stopped:
+        what = str(stopped).rpartition("; ")[0]
+        again = "run the same command again to continue"
+        raise StoppedEarly(f"{what}; {again}", stopped.exit_code) from None
     return True
 
 

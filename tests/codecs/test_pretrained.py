@@ -188,8 +188,20 @@ def test_weights_of_another_kind_are_refused(folders, tmp_path):
 
     slower = AutoencoderKLWan(base_dim=4, num_res_blocks=1, temperal_downsample=[True] * 3)
     slower.save_pretrained(tmp_path / "slower")
-    with pytest.raises(DataError, match="halves time twice"):
+    with pytest.raises(DataError, match=r"Wan 2\.1, and .* another model"):
         make("wan", tmp_path / "slower")
+
+
+def test_wan_2_2_is_refused_by_its_version_before_weights_are_read(tmp_path):
+    (tmp_path / "config.json").write_text(
+        json.dumps({"_class_name": "AutoencoderKLWan", "patch_size": 2, "z_dim": 48})
+    )
+    with pytest.raises(DataError, match=r"holds that of Wan 2\.2"):
+        make("wan", tmp_path)
+    state = {"encoder.conv1.weight": torch.zeros(8, 12, 3, 3, 3), "conv2.weight": torch.zeros(48)}
+    torch.save(state, tmp_path / "Wan2.2_VAE.pth")
+    with pytest.raises(DataError, match=r"holds that of Wan 2\.2"):
+        make("wan", tmp_path / "Wan2.2_VAE.pth")
 
 
 @pytest.mark.parametrize(

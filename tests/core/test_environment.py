@@ -12,7 +12,9 @@ from acwm_core.env.environment import (
     resolve_size,
 )
 from acwm_core.env.episode import Episode, EpisodeSpec, Factor, draw_factors, ood_label
+from acwm_core.env.task import Task
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
+from acwm_core.evaluation.metric import MetricInfo
 
 GAIN = Factor.continuous(
     "gain", "speed", train=(0.5, 1.0), ood=((1.5, 2.0), (0.1, 0.2)), nominal=0.75, active=True
@@ -200,3 +202,17 @@ def test_an_episode_checks_its_lengths():
         Episode(**{**parts, "actions": np.zeros((2, 2), np.float32)})
     with pytest.raises(ShapeError, match="must be zero"):
         Episode(**{**parts, "actions": np.ones((3, 2), np.float32)})
+
+
+def test_the_unit_of_a_pure_number_is_not_shown():
+    """SI calls it 1."""
+    assert ActionSpec(("a", "b"), ("1", "m"), (0, 0), (1, 1), "delta").units == ("", "m")
+    assert StateField("ratio", (), "1", "of it").unit == ""
+    span = {"train": (0.0, 1.0), "ood": ((2.0, 3.0),), "nominal": 0.5}
+    assert Factor.continuous("friction", "of it", **span, unit="1").unit == ""
+    assert MetricInfo("1", True).unit == ""
+
+    class Share(Task):
+        unit = "1"
+
+    assert Share.unit == ""

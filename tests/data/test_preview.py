@@ -20,7 +20,7 @@ def test_the_facts_agree_with_the_files(square_data):
         about = facts["splits"][split]
         files = list((square_data / split).glob("*.tar"))
         assert about["episodes"] == about["made"] == count
-        assert about["frames"] == 21 * count
+        assert (about["frames"], about["lengths"]) == (21 * count, [21, 21])
         assert about["shards"] == len(files)
         assert about["bytes"] == sum(file.stat().st_size for file in files)
     assert facts["splits"]["ood_test"]["ood_labels"] == {"colour=90": 3, "speed": 2}

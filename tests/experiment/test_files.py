@@ -43,8 +43,7 @@ def test_a_file_becomes_a_table_of_runs(tmp_path):
     assert rope.choice == DataChoice(None, (32, 64), 5, 0.4)
     names = [run.folder.name for run in made.runs]
     assert names[:3] == [
-        "push_cube+small-0", "push_rope+small,model.layers=2-0",
-        "push_cube+small,conditioner=cross_attention-0",
+        "push_cube+small-0", "push_rope+small-layers2-0", "push_cube+small-cross_attention-0",
     ]  # fmt: skip
     assert [run.recipe.training["seed"] for run in made.runs] == [0] * 3 + [3] * 3
     assert made.runs[1].recipe.model.params["layers"] == 2

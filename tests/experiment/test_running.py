@@ -13,7 +13,7 @@ from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until
 
 STEPS = 6  # one dataset, two trainings and evaluations, a report
-RUNS = ("tiny-0", "tiny,model.width=6-0")
+RUNS = ("tiny-0", "tiny-width6-0")
 
 
 def results(folder):
@@ -115,7 +115,7 @@ def test_a_failed_run_is_told_and_tried_again(acwm, whole, tmp_path):
     made = tmp_path / "experiments" / "widths"
     code, out, err = acwm("experiment", "widths.yaml", cwd=tmp_path)
     assert code == 1, err
-    name = "train-tiny,model.fails=true-0"
+    name = "train-tiny-fails-true-0"
     lines = out.splitlines()
     assert lines[0] == f"{STEPS - 2} of {STEPS} steps are done, 3 of them in earlier runs"
     assert lines[1].startswith(f"failed: {name}: ")

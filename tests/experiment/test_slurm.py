@@ -81,7 +81,7 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
         assert code == 0, err
     wait_until(all_ended(cluster))
     assert (tmp_path / "experiments" / "again" / "report.html").exists()
-    failed = "tiny,model.fails=true-0"
+    failed = "tiny-fails-true-0"
     simulation = job_of(tmp_path, "simulate-data_square")
     assert slurm.options(cluster, simulation)["dependency"] == "singleton"
     assert slurm.state(cluster, job_of(tmp_path, f"train-{failed}")) == "FAILED"

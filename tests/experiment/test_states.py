@@ -136,7 +136,7 @@ def test_an_evaluation_counts_if_it_is_of_these_weights_and_settings(made, tmp_p
 def test_only_what_is_missing_is_left(made):
     steps = all_steps(made)
     left = [step.name for step in steps if all_progress(steps, made)[step.name] < 1]
-    assert left == ["train-mine,model.width=6-0", "evaluate-mine,model.width=6-0", "report"]
+    assert left == ["train-mine-width6-0", "evaluate-mine-width6-0", "report"]
     made.experiment.write(made.folder)
     assert evaluated_runs(made.folder) == [made.runs[0].folder]
     (made.folder / "experiment.json").write_text('{"format": 1}')

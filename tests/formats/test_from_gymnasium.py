@@ -8,7 +8,9 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from acwm_core.cli import main
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
 from acwm_formats.check import check_dataset
@@ -233,3 +235,28 @@ def test_policies_and_environments_lie_in_the_current_folder(tmp_path, monkeypat
     )
     actions = EpisodeDataset("out", "ind_test")[1].actions
     assert actions[:, 0].tolist() == [0.5, 0.5, 0.5, 0]
+
+
+def test_frames_that_grow_are_told_with_their_sizes(tmp_path):
+    class Growing(toy_envs.Dot):
+        def render(self):
+            return np.pad(super().render(), ((0, int(self._position[1])), (0, 0), (0, 0)))
+
+    with pytest.raises(DataError, match=r"frames of \d+×44 first and of \d+×44 in frame \d+"):
+        imported(rollouts(Growing("rgb_array"), "growing", (2, 1)), tmp_path / "data")
+
+
+def test_a_rate_below_one_is_kept(tmp_path):
+    class Slow(toy_envs.Dot):
+        metadata = toy_envs.Dot.metadata | {"render_fps": 0.5}
+
+    card = imported(rollouts(Slow("rgb_array"), "slow", (2, 1), frames=6), tmp_path / "data")
+    assert card.environment.fps == 0.5
+
+
+def test_lengths_are_told_as_a_range(tmp_path):
+    data = tmp_path / "data"
+    imported(rollouts(toy_envs.Dot("rgb_array"), "dot", (6, 2)), data)
+    lengths = [n for split in ("train", "ind_test") for n in EpisodeDataset(data, split).lengths]
+    told = CliRunner().invoke(main, ["data", "info", str(data)])
+    assert f" {min(lengths)} to {max(lengths)} frames per episode" in told.output

@@ -145,3 +145,12 @@ def test_a_recording_that_cannot_be_is_named(tmp_path, change, problem):
     recordings[1] = good  # fixed, it resumes
     assert write(tmp_path / "data", {"train": recordings}).splits == {"train": 3}
     assert DatasetCard.read(tmp_path / "data").source["kind"] == "python"
+
+
+def test_a_refused_call_leaves_no_folder(tmp_path):
+    good = Mine(2)
+    bad = [good[0], Recording(good[1].video, good[1].actions[:-3], good[1].states)]
+    with pytest.raises(DataError):
+        write(tmp_path / "data", {"train": bad})
+    assert not (tmp_path / "data").exists()
+    assert write(tmp_path / "data", {"train": good}).splits == {"train": 2}

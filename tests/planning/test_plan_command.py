@@ -60,6 +60,7 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert len(frames) == steps + 1
     assert frames[0].shape[1] > 2.9 * frames[0].shape[0]  # happened, imagined and goal
     assert str(folder) in out
+    assert re.search(r"at most about \d+ s for 14 episodes", err)
     check_video(folder, made, steps)
 
     code, _, err = acwm(capsys, *words, "--seeds", "0..2")

@@ -7,9 +7,10 @@ import math
 import pytest
 from scipy.stats import beta
 
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmWarning, DataError
+from acwm_planning.commands import print_table
 from acwm_planning.resumable import EPISODES_FILE, ResumableResults
-from acwm_planning.table import mcnemar, missing_episodes, summarise
+from acwm_planning.table import EpisodeLine, mcnemar, missing_episodes, summarise
 
 
 def line(row, seed, success, **facts):
@@ -84,3 +85,36 @@ def test_a_number_that_is_not_finite_is_no_result(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         ResumableResults(tmp_path, {}).add(line("model", 0, True, distance=math.nan))
     assert json.loads((tmp_path / "settings.json").read_text()) == {}
+
+
+def test_damaged_results_are_told_and_their_episodes_played_again(tmp_path):
+    def results():
+        return ResumableResults(tmp_path, {"past": 0}, kind=EpisodeLine)
+
+    results().add(*(line("model", seed, True) for seed in range(4)))
+    path = tmp_path / EPISODES_FILE
+    lines = path.read_bytes().splitlines()
+    lines[0] = b"\xff\xfe" + lines[0]
+    lines[1] = lines[1].replace(b'"success": true', b'"success": "yes"')
+    lines[2] = b"[1, 2]"
+    path.write_bytes(b"\n".join(lines) + b"\n")
+    with pytest.warns(AcwmWarning, match=r"damaged lines \(3\)"):
+        assert [each["seed"] for each in results().finished()] == [3]
+    for content in (b"", b"[]", b"{", b"\xff"):
+        (tmp_path / "settings.json").write_bytes(content)
+        with pytest.raises(DataError, match=r"settings\.json is not settings"):
+            results()
+
+
+def test_no_distance_is_below_zero():
+    distances = (0.0, 0.1, 0.2, 0.3, 0.1, 9.0, 0.2, 0.1)
+    lines = [line("model", seed, True, distance=value) for seed, value in enumerate(distances)]
+    (row,) = summarise(lines)
+    assert row.distance.low == 0
+
+
+def test_the_printed_table_fits_a_terminal(capsys):
+    more = {"seconds_per_decision": 12.345, "rollouts_per_decision": 4096.0}
+    rows = [line("simulator", seed, seed % 7 == 0, **more) for seed in range(50)]
+    print_table(summarise([line("model", seed, True, **more) for seed in range(50)] + rows))
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

@@ -9,6 +9,7 @@ import pytest
 
 from acwm_core.plugins import catalog
 from acwm_play.action_source import PERSON, POLICY, ActionSource
+from acwm_play.messages import Point
 from acwm_play.worlds import tasks_of
 from tests.play import drivers
 from tests.play.test_server import dark, played
@@ -151,3 +152,24 @@ def test_nobody_unknown_drives_and_none_in_a_world_without_tasks():
     assert source.driver == PERSON
     assert asyncio.run(source.ready(live, asyncio.Event()))
     assert told == []
+
+
+def test_places_that_a_world_does_not_have_are_passed_over():
+    acted = []
+
+    async def act(action):
+        acted.append(action)
+
+    async def still():
+        return np.zeros(2)
+
+    simulator = SimpleNamespace(
+        pointing=SimpleNamespace(action=np.ravel),
+        card=SimpleNamespace(action=SimpleNamespace(size=2)),
+        still=still,
+    )
+    source = ActionSource(lambda kind, **values: None)
+    for places in ([[0.25, 0.5]], [[0.25, 0.5], [0.75, 1.0]]):
+        source.hold(Point(places))
+        asyncio.run(source.act(SimpleNamespace(simulator=simulator, act=act)))
+    assert [each.tolist() for each in acted] == [[0.25, 0.5], [0, 0]]

@@ -1,6 +1,7 @@
 """`acwm rank`, from words to a table, and what it refuses."""
 
 import json
+import re
 import shutil
 
 import pytest
@@ -41,6 +42,8 @@ def test_a_ranking_is_made_and_gone_on_with(mine, capsys, tmp_path, monkeypatch)
     assert "3 policies, 2 episodes of each" in out
     assert "walkers:walker" in out
     assert str(folder) in out
+    assert all(len(text) <= 80 for text in out.splitlines() if str(folder) not in text)
+    assert re.search(r"about \d+ s for 2 starts", err)
     code, _, err = acwm(capsys, *words, "--seeds", "0..2")
     assert code == 0, err
     lines = (folder / "episodes.jsonl").read_text().splitlines()

@@ -240,3 +240,12 @@ def test_a_model_of_a_third_party_needs_neither_noise_nor_matrices():
     assert world.rollout(first, actions).shape == (2, 9, 3, 16, 24)
     with pytest.raises(RecipeError, match="cannot be streamed"):
         world.stream(first)
+
+
+def test_gradients_have_the_strides_of_their_weights():
+    """Otherwise DDP warns and copies; with bfloat16, a 1×1 kernel's are those of channels last."""
+    model = RecurrentModel(latent_channels=16, channels=64, width=16, blocks=1)
+    conditioning = Conditioning(torch.randn(2, 4, 16), None, model)
+    with torch.autocast("cpu", torch.bfloat16):
+        model(torch.randn(2, 1, 16, 8, 8), conditioning, 4).sum().backward()
+    assert all(each.grad.stride() == each.stride() for each in model.parameters())

@@ -19,6 +19,7 @@ from acwm_core.training.checkpoints import (
     last_whole,
     read_details,
     read_shares,
+    read_step,
     read_whole,
     write_file,
     write_folder,
@@ -233,3 +234,13 @@ def test_resuming_a_strangers_run_runs_nothing(data, tmp_path):
         with pytest.raises(TrainingError, match=r"cannot be read|is damaged"):
             fit(recipe, run, resume=run)
         assert not mark.exists()
+
+
+@pytest.mark.parametrize("step", [-5, 2.5, None])
+def test_a_number_of_steps_that_cannot_be_is_damage(tmp_path, step):
+    torch.save({"global_step": step}, tmp_path / "last.ckpt")
+    with pytest.raises(TrainingError, match=r"last\.ckpt is damaged .*global_step"):
+        read_step(tmp_path / "last.ckpt")
+    torch.save([step], tmp_path / "last.ckpt")
+    with pytest.raises(TrainingError, match=r"last\.ckpt is damaged"):
+        read_step(tmp_path / "last.ckpt")

@@ -1,6 +1,7 @@
 import pytest
 
 from acwm_core.errors import RecipeError
+from acwm_core.recipe.check import check_names
 from acwm_core.training.config import TrainingConfig
 
 
@@ -32,3 +33,11 @@ def test_impossible_values_are_refused_by_name(name, value):
 
 def test_lists_from_yaml_become_tuples():
     assert TrainingConfig(betas=[0.8, 0.9]).betas == (0.8, 0.9)
+
+
+def test_muon_is_refused_with_shards_before_anything_is_imported():
+    recipe = {"training": {"optimizer": "muon"}, "trainer": {"strategy": "fsdp"}}
+    names = {"codec": "identity", "model": "recurrent", "conditioner": "adaln"}
+    parts = {part: {"name": name} for part, name in (*names.items(), ("objective", "regression"))}
+    with pytest.raises(RecipeError, match="muon needs whole matrices"):
+        check_names({**parts, "data": {"path": "x"}, **recipe})

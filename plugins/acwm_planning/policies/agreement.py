@@ -16,6 +16,7 @@ from acwm_core.evaluation.statistics import (
     Estimate,
     defined,
     with_interval,
+    within,
 )
 from acwm_planning.policies.ranking import Agreement, Decisions
 
@@ -114,8 +115,9 @@ def regret(judge: Scores, truth: Scores) -> tuple[float, float]:
 def decisions(judge: list[Scores], truth: list[Scores]) -> Decisions:
     """Regrets of choices at many starts, with intervals over the starts."""
     regrets = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
-    means = [
+    lost, chance, gain = (
         with_interval(float(each.mean()), [each])
         for each in (regrets[:, 0], regrets[:, 1], regrets[:, 1] - regrets[:, 0])
-    ]
-    return Decisions(len(regrets), *means)
+    )
+    regret_bounds = 0.0, math.inf
+    return Decisions(len(regrets), within(lost, regret_bounds), within(chance, regret_bounds), gain)

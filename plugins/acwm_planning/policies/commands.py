@@ -70,8 +70,8 @@ def print_ranking(ranking: Ranking) -> None:
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:  # a file or a pipe has no width
         console.width = 200
-    scores = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    heads = ("policy", "loop", "success: true", "model", "return: true", "model")
+    scores = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    heads = ("policy", "loop", "success\n(true)", "(model)", "return\n(true)", "(model)")
     for head in heads:
         scores.add_column(head, justify="left" if head in ("policy", "loop") else "right")
     for each in ranking.policies:
@@ -87,27 +87,30 @@ def print_ranking(ranking: Ranking) -> None:
                 f"read the distance in the {'true' if judge == 'estimator' else 'predicted'} "
                 "frames; the start distance is used instead"
             )
-    agreement = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    agreement = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     for head in ("", "of", "Pearson", "Spearman", "Kendall", "MMRV", "optimism"):
         agreement.add_column(head, justify="left" if head in ("", "of") else "right")
     for judge, by_score in ranking.agreement.items():
         for score, each in by_score.items():
             values = each.pearson, each.spearman, each.kendall, each.mmrv, each.optimism
-            agreement.add_row(
-                judge, score.replace("returns", "return"), *map(format_estimate, values)
-            )
+            cells = (format_estimate(value).replace(" (", "\n").rstrip(")") for value in values)
+            agreement.add_row(judge, score.replace("returns", "return"), *cells)
     console.print(agreement)
+    console.print(
+        "below each number its 95 % interval; MMRV: mean maximum rank violation;\n"
+        "optimism: judge minus truth; estimator: reads the true frames, a ceiling"
+    )
     for judge, decisions in ranking.decisions.items():
         console.print(
             f"{judge}: choosing among action sequences loses {format_estimate(decisions.regret)} "
-            f"{ranking.unit} per action, at random {format_estimate(decisions.chance)}"
+            f"{ranking.unit}\nper action, at random {format_estimate(decisions.chance)}"
         )
 
 
 def format_estimate(estimate: Estimate) -> str:
-    """Format an estimate, e.g. ``0.82 (0.61 to 0.93)``."""
+    """Format an estimate, e.g. ``0.82 (0.61…0.93)``."""
     if estimate.value is None:
         return "–"
     known = estimate.low is not None and estimate.high is not None
-    interval = f" ({estimate.low:.2g} to {estimate.high:.2g})" if known else ""
+    interval = f" ({estimate.low:.2g}…{estimate.high:.2g})" if known else ""
     return f"{estimate.value:.2g}{interval}"

@@ -30,7 +30,13 @@ from acwm_planning.policies.own import OwnPolicy
 
 
 class Judge(ABC):
-    """Rolls out actions and policies, and judges the outcomes."""
+    """Rolls out actions and policies, and judges the outcomes.
+
+    Attributes:
+        batch: number of action sequences that are rolled out at once.
+    """
+
+    batch: int = 1
 
     @abstractmethod
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
@@ -142,13 +148,13 @@ class ModelJudge(Judge):
         batch: int = 16,
     ) -> None:
         self._world, self._estimator, self._task = world_model, estimator, task
-        self._steps, self._batch = steps, batch
+        self._steps, self.batch = steps, batch
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
         """All sequences get the same noise, so they differ only in actions."""
         outcomes: list[Outcome] = []
-        for first in range(0, len(actions), self._batch):
-            outcomes += self._replay_batch(start, np.stack(actions[first : first + self._batch]))
+        for first in range(0, len(actions), self.batch):
+            outcomes += self._replay_batch(start, np.stack(actions[first : first + self.batch]))
         return outcomes
 
     def _replay_batch(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.score import estimator_for
-from acwm_core.executors import progress_bar
+from acwm_core.executors import duration, progress_bar
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
@@ -37,7 +39,7 @@ from acwm_planning.policies.scripted import (
     is_solvable,
     parse_policy,
 )
-from acwm_planning.policies.table import DECISION, summarise
+from acwm_planning.policies.table import DECISION, DecisionLine, PolicyLine, summarise
 from acwm_planning.resumable import Line, ResumableResults
 
 SCRIPTED = "scripted"
@@ -59,6 +61,9 @@ class Ranker:
         estimator: also reads the true frames, which shows the effect of its own errors.
         policies: policies to roll out.
         script: policy whose actions the decisions choose from.
+
+    Attributes:
+        left: what failed, and is left out.
     """
 
     def __init__(
@@ -69,7 +74,7 @@ class Ranker:
         policies: Sequence[ScriptedPolicy | OwnPolicy],
         script: ScriptedPolicy,
     ) -> None:
-        self.policies, self._script = list(policies), script
+        self.policies, self._script, self.left = list(policies), script, LeftOut()
         self._simulator, self._model, self._estimator = simulator, model, estimator
         self._environment = simulator.environment
         self._steps = self._environment.task.max_steps
@@ -78,17 +83,30 @@ class Ranker:
         """Names of everything that is rolled out from a start: the policies, and the decision."""
         return [*(policy.name for policy in self.policies), DECISION]
 
-    def lines(self, seed: int, names: Sequence[str], left: LeftOut) -> list[Line]:
+    def seconds(self, seeds: Sequence[int]) -> float:
+        """How long all takes from a start, about, as playing and predicting one sequence takes."""
+        card, batch = self._environment.environment.card, self._model.batch
+        start = first_start(self._simulator, card, seeds)
+        began = time.perf_counter()
+        actions = self._play(start, self._script).actions
+        played = time.perf_counter()
+        rows = len(self.policies) + 1 + len(BRANCHES)
+        self._model.replay(start, [actions] * min(batch, rows))
+        predicted = time.perf_counter() - played
+        plays = len(self.policies) + 2 + 1 + len(BRANCHES)  # those of a decision are played again
+        return plays * (played - began) + -(-rows // batch) * predicted
+
+    def lines(self, seed: int, names: Sequence[str]) -> list[Line]:
         """Results for some of `names`, from the start of a seed, without those that fail."""
         start = self._simulator.start(spec_of_seed(self._environment.environment.card, seed))
         chosen = [policy for policy in self.policies if policy.name in names]
         episodes: dict[str, PolicyEpisode] = {}
         for policy in (each for each in chosen if isinstance(each, ScriptedPolicy)):
-            with left.trying(policy.name, seed):
+            with self.left.trying(policy.name, seed):
                 episodes[policy.name] = self._play(start, policy)
         branches: list[tuple[str, NDArray[np.float32]]] = []
         if DECISION in names:
-            with left.trying(DECISION, seed):
+            with self.left.trying(DECISION, seed):
                 branches = self._branches(start, seed)
         rows = [each.actions for each in episodes.values()] + [rows for _, rows in branches]
         outcomes = self._model.replay(start, rows) if rows else []
@@ -96,7 +114,7 @@ class Ranker:
         for (name, true), seen in zip(episodes.items(), outcomes, strict=False):
             lines.append(self._line(name, seed, "open", start, true, seen))
         for policy in (each for each in chosen if isinstance(each, OwnPolicy)):
-            with left.trying(policy.name, seed):
+            with self.left.trying(policy.name, seed):
                 true = self._simulator.play_own(start, policy, self._steps)
                 seen = self._model.perform(start, policy, self._steps)
                 lines.append(self._line(policy.name, seed, "closed", start, true, seen))
@@ -190,7 +208,8 @@ def rank_policies(
         ranker = Ranker(simulator, model, estimator, chosen, script)
         identity = {"environment": bundle.card.name, "task": task, "unit": goal_task.unit}
         settings = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
-        results = ResumableResults(out, {**identity, **settings}, ("policy", "seed"))
+        keys, kind = ("policy", "seed"), PolicyLine | DecisionLine
+        results = ResumableResults(out, {**identity, **settings}, keys, kind)
         with results.adding():
             _roll_out(ranker, results, seeds, progress)
             ranking = summarise(results)
@@ -233,12 +252,15 @@ def _roll_out(
     finished = {(str(line["policy"]), int(line["seed"])) for line in results.finished()}
     missing = {seed: [n for n in ranker.names() if (n, seed) not in finished] for seed in seeds}
     total, count = len(seeds) * len(ranker.names()), sum(map(len, missing.values()))
-    left = LeftOut()
     what = f"ranking at {results.settings['task']}"
     with progress_bar(what, total, done=total - count, shown=progress) as advance:
-        for seed in (seed for seed, names in missing.items() if names):
-            with left.trying("every policy", seed):
-                results.add(*ranker.lines(seed, missing[seed], left))
+        left = [seed for seed, names in missing.items() if names]
+        if progress and left:
+            about = duration(len(left) * ranker.seconds(left))
+            print(f"about {about} for {len(left)} starts", file=sys.stderr, flush=True)
+        for seed in left:
+            with ranker.left.trying("every policy", seed):
+                results.add(*ranker.lines(seed, missing[seed]))
             advance(len(missing[seed]))
-    if left.error and not results.finished():
-        raise left.error
+    if ranker.left.error and not results.finished():
+        raise ranker.left.error

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +18,41 @@ DECISION = "decision"
 
 JUDGES = ("estimator", "model")
 """What is compared with the truth: the estimator on true frames, and on the model's frames."""
+
+
+@dataclass(frozen=True)
+class _Judged:
+    success: bool
+    returns: float
+
+
+@dataclass(frozen=True)
+class PolicyLine:
+    """An episode of a policy, as `acwm rank` writes it."""
+
+    policy: str
+    seed: int
+    loop: str
+    truth: _Judged
+    estimator: _Judged
+    model: _Judged
+
+
+@dataclass(frozen=True)
+class _Branch:
+    truth: float
+    estimator: float
+    model: float
+
+
+@dataclass(frozen=True)
+class DecisionLine:
+    """The choice among action sequences from a start, as `acwm rank` writes it."""
+
+    policy: Literal["decision"]
+    seed: int
+    branches: list[_Branch]
+
 
 SCORES = ("success", "returns")
 
