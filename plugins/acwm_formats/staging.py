@@ -25,7 +25,7 @@ from acwm_core.env.card import ActionSpec
 from acwm_core.env.episode import EpisodeSpec, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import Report
-from acwm_core.files import writing, written_whole
+from acwm_core.files import disk_error, writing, written_whole
 from acwm_formats.alignment import PlannedEpisode
 from acwm_formats.frames import file_stamp
 from acwm_formats.reading import Reading, Scan, episode_name, opened, scanned
@@ -82,6 +82,9 @@ def _recording(task: StageTask, index: int) -> Staged:
         for episode in aligned.episodes:
             files.append(_staged(task, recording, episode))
     except (DataError, OSError) as error:
+        full = disk_error(error)
+        if full and full.filename and Path(full.filename).parent == task.folder:
+            raise  # it is no defect of this recording
         found = Scan.of_defect(task.split, index, name, str(error))
         return Staged(found, ())
     return Staged(scanned(task.split, index, aligned, task.sampled, ()), tuple(files))

@@ -1,5 +1,7 @@
 """`write_dataset`: a format of one's own becomes a dataset like any other."""
 
+import contextlib
+import errno
 from fractions import Fraction
 
 import numpy as np
@@ -10,6 +12,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.card import exact_rate
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError, ShapeError
+from acwm_formats import staging
 from acwm_formats.alignment import Alignment
 from acwm_formats.arrays import Recording, write_dataset
 from acwm_formats.check import check_dataset
@@ -154,3 +157,17 @@ def test_a_refused_call_leaves_no_folder(tmp_path):
         write(tmp_path / "data", {"train": bad})
     assert not (tmp_path / "data").exists()
     assert write(tmp_path / "data", {"train": good}).splits == {"train": 2}
+
+
+def test_a_full_disk_is_no_defect_of_recordings_to_leave_out(tmp_path, monkeypatch):
+    written = staging.written_whole
+
+    @contextlib.contextmanager
+    def full(path):
+        with written(path) as partial:
+            yield partial
+            raise OSError(errno.ENOSPC, "No space left on device", str(partial))
+
+    monkeypatch.setattr(staging, "written_whole", full)
+    with pytest.raises(DataError, match=r"cannot write to .*No space left"):
+        write(tmp_path / "data", {"train": Mine(2)}, alignment=Alignment(on_defect="skip"))
