@@ -51,6 +51,7 @@ def simulate(
     frames: int | None = None,
     perturbation: float = 0.0,
     symmetry: Symmetry | None = None,
+    start: int = 0,
 ) -> Episode:
     """Run one episode of T frames and record everything about it.
 
@@ -62,6 +63,7 @@ def simulate(
         frames: T; by default and at most ``card.horizon``.
         perturbation: how far to perturb the start state; see `Environment._perturb`.
         symmetry: transforms the start state, but no actions; see `Environment._transform`.
+        start: number of the perturbed start, of those that differ by as much.
 
     Raises:
         ShapeError: `actions` has neither T nor T − 1 rows.
@@ -78,7 +80,12 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    options = {"spec": spec, "perturbation": perturbation, "symmetry": symmetry}
+    options = {
+        "spec": spec,
+        "perturbation": perturbation,
+        "perturbed_start": start,
+        "symmetry": symmetry,
+    }
     card = environment.card
     taken = np.zeros((horizon, card.action.size), np.float32)
     video: list[NDArray[Any]] = []

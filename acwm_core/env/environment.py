@@ -135,8 +135,8 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             seed: seeds the sequence of episodes, as in Gymnasium.
             options: ``{"spec": EpisodeSpec}`` selects the episode; ``{"split": …}`` and
                 ``{"factors": {name: setting}}`` configure a new one. ``{"perturbation": amount}``
-                perturbs its start, see `_perturb`; ``{"symmetry": Symmetry}`` transforms it before
-                that, see `_transform`.
+                perturbs its start, see `_perturb`, and ``{"perturbed_start": k}`` the k-th time;
+                ``{"symmetry": Symmetry}`` transforms it before that, see `_transform`.
 
         Raises:
             RecipeError: unknown split or factor, an impossible factor value, no perturbed or no
@@ -159,7 +159,9 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         if not isinstance(amount, (int, float)) or not 0 <= amount < np.inf:
             raise RecipeError(f"perturbation={amount!r}: give 0 or a positive number")
         if amount > 0:
-            self._perturb(float(amount), spec.rng("perturbation"))
+            start = int(options.get("perturbed_start", 0))
+            stream = f"perturbation {start}" if start else "perturbation"
+            self._perturb(float(amount), spec.rng(stream))
         return self.observe()
 
     def step(

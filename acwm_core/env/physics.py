@@ -187,6 +187,11 @@ class Physics:
     unseen: float = math.inf
     camera: ViewingCamera | None = None
 
+    @property
+    def positions(self) -> list[Reading]:
+        """The readings that are positions in m, of bodies and of the points of curves."""
+        return [reading for reading in self.readings if reading.kind in ("position", "curve")]
+
 
 class StateEstimator(ABC):
     """Estimates masks and states from videos of one environment, without its simulator.

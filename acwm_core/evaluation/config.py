@@ -16,7 +16,8 @@ MINIMA = {
     **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
     **dict.fromkeys(("cuts", "steps", "batch_size", "context_frames", "samples"), 1),
     **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
-    **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes"), 0),
+    **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes", "ensemble_episodes"), 0),
+    "ensemble_starts": 4,
 }
 """The smallest allowed value of each setting that is not None."""
 
@@ -68,6 +69,9 @@ class EvaluationConfig:
             metrics that read states; 0 for none. Pixel metrics are measured on all episodes.
         perturbed_episodes: number of clips per split that the simulator repeats from a slightly
             different start, for the predictability horizon; 0 for none.
+        ensemble_episodes: number of clips per split whose draws are compared with the simulator's
+            own futures, from starts that differ by what a pixel resolves; 0 for none.
+        ensemble_starts: number of these starts of each clip. Each costs a simulation.
         severity_episodes: number of episodes at each factor value of `acwm evaluate --sweep`.
         device: where the model runs, e.g. ``"cpu"`` or ``"cuda:1"``; ``"auto"`` takes a GPU if
             there is one.
@@ -93,6 +97,8 @@ class EvaluationConfig:
     counterfactual_episodes: int = 2
     noise_floor_episodes: int = 8
     perturbed_episodes: int = 8
+    ensemble_episodes: int = 0
+    ensemble_starts: int = 16
     severity_episodes: int = 16
     device: str = "auto"
 

@@ -316,6 +316,7 @@ def _summarise(
         },
         protocol=config.protocol,
         left_out={**evaluator.left_out, **found.left_out},
+        ensembles=found.ensembles,
         published=entrant.published,
     )
 

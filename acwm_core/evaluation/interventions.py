@@ -23,17 +23,18 @@ from acwm_core.evaluation.counterfactual import (
     ratio,
     simulate_branches,
 )
-from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.ensemble import compare_ensembles
+from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.protocol import protocol_named
-from acwm_core.evaluation.results import Counterfactual, Predictability, Score
+from acwm_core.evaluation.results import Counterfactual, Ensemble, Predictability, Score
 from acwm_core.evaluation.score import build_metrics, score, split_available
 from acwm_core.evaluation.statistics import finite
 from acwm_core.evaluation.videos import ShownClip
 from acwm_core.model.world_model import CLIP_FRAMES
 
-COUNTERFACTUAL, PERTURBED = "counterfactual", "perturbed"
-"""Names of the two tests in `Summary.left_out`."""
+COUNTERFACTUAL, PERTURBED, ENSEMBLE = "counterfactual", "perturbed", "ensemble"
+"""Names of the tests in `Summary.left_out`."""
 
 TRIED_FRAMES = 8
 """How many frames of an episode the simulator must reproduce."""
@@ -56,6 +57,7 @@ class Interventions:
     scores: dict[str, list[Score]] = field(default_factory=dict[str, list[Score]])
     predictability: dict[str, Predictability] = field(default_factory=dict[str, Predictability])
     counterfactual: dict[str, Counterfactual] = field(default_factory=dict[str, Counterfactual])
+    ensembles: dict[str, Ensemble] = field(default_factory=dict[str, Ensemble])
     videos: list[ShownClip] = field(default_factory=list[ShownClip])
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -93,15 +95,19 @@ def asked_clips(config: EvaluationConfig, clips: Clips) -> dict[str, Clips]:
     """The clips of each test, by test and split.
 
     The counterfactual test takes the first clips that start at their episode's first frame. The
-    perturbed test takes the first clips, but none under a protocol whose clips may start later.
+    others take the first clips, but none under a protocol whose clips may start later.
     """
-    moved = config.perturbed_episodes * protocol_named(config.protocol).from_first_frame
+    movable = protocol_named(config.protocol).from_first_frame
+    moved = {PERTURBED: config.perturbed_episodes, ENSEMBLE: config.ensemble_episodes}
     return {
         COUNTERFACTUAL: {
             split: [clip for clip in each if clip.start == 0][: config.counterfactual_episodes]
             for split, each in clips.items()
         },
-        PERTURBED: {split: each[:moved] for split, each in clips.items()},
+        **{
+            test: {split: each[: number * movable] for split, each in clips.items()}
+            for test, number in moved.items()
+        },
     }
 
 
@@ -110,14 +116,14 @@ def units_of_work(evaluator: Evaluator, clips: Clips) -> int:
     branches = len(ROWS) * (1 + max_branches(evaluator.card.action))
     asked = asked_clips(evaluator.config, clips)
     count = {name: sum(map(len, each.values())) for name, each in asked.items()}
-    return branches * count[COUNTERFACTUAL] + count[PERTURBED]
+    return branches * count[COUNTERFACTUAL] + count[PERTURBED] + count[ENSEMBLE]
 
 
 def intervene(
     evaluator: Evaluator, clips: Clips, datasets: Mapping[str, EpisodeDataset]
 ) -> Interventions:
     """Run the tests that need the simulator, if it is available and the config asks for them."""
-    config, card, found = evaluator.config, evaluator.card, Interventions()
+    config, found = evaluator.config, Interventions()
     metrics = build_metrics(config.counterfactual_metrics, config.metric_options, of_branches=True)
     asked = {n: s for n, s in asked_clips(config, clips).items() if any(s.values())}
     if not metrics:
@@ -131,26 +137,52 @@ def intervene(
         found.left_out.update(dict.fromkeys(sorted(asked), str(error)))
         return found
     with contextlib.closing(environment):
-        if PERTURBED in asked and not environment.can_be_perturbed:
-            found.left_out[PERTURBED] = f"{card.name} has no perturbed start"
-            del asked[PERTURBED]
+        for test, reason in _unavailable(evaluator, environment).items():
+            if asked.pop(test, None):
+                found.left_out[test] = reason
         if COUNTERFACTUAL in asked:
-            metrics, left_out = split_available(metrics, card, evaluator.estimator)
+            metrics, left_out = split_available(metrics, evaluator.card, evaluator.estimator)
             found.left_out.update(left_out)
-        frames = min(evaluator.world_model.clip_frames, evaluator.given + CLIP_FRAMES - 1)
-        for split, few in asked.get(COUNTERFACTUAL, {}).items():
-            simulated = simulate_branches(
-                environment, few, datasets[split], frames, evaluator.estimator
-            )
-            if few:
-                made = counterfactual(evaluator, metrics, simulated)
-                found.counterfactual[split], videos = made
-                found.videos.extend(videos if config.videos else ())
+            _respond(evaluator, environment, metrics, asked[COUNTERFACTUAL], datasets, found)
         for split, few in asked.get(PERTURBED, {}).items():
             found.scores[split], found.predictability[split] = perturbed(
                 evaluator, environment, few, datasets[split]
             )
+        for split, few in asked.get(ENSEMBLE, {}).items():
+            if few:
+                found.ensembles[split] = compare_ensembles(
+                    evaluator, environment, few, datasets[split]
+                )
     return found
+
+
+def _respond(
+    evaluator: Evaluator,
+    environment: Environment,
+    metrics: Mapping[str, Metric],
+    clips: Clips,
+    datasets: Mapping[str, EpisodeDataset],
+    found: Interventions,
+) -> None:
+    """Add the responses to other actions, and their videos, to what was found."""
+    frames = min(evaluator.world_model.clip_frames, evaluator.given + CLIP_FRAMES - 1)
+    for split, few in clips.items():
+        if few:
+            simulated = simulate_branches(
+                environment, few, datasets[split], frames, evaluator.estimator
+            )
+            found.counterfactual[split], videos = counterfactual(evaluator, metrics, simulated)
+            found.videos.extend(videos if evaluator.config.videos else ())
+
+
+def _unavailable(evaluator: Evaluator, environment: Environment) -> dict[str, str]:
+    """Why tests with perturbed starts cannot be run here, by test."""
+    name, estimator = evaluator.card.name, evaluator.estimator
+    if not environment.can_be_perturbed:
+        return dict.fromkeys((PERTURBED, ENSEMBLE), f"{name} has no perturbed start")
+    if estimator is None or not estimator.physics.positions:
+        return {ENSEMBLE: f"nothing says what a pixel of {name} resolves: no positions are read"}
+    return {}
 
 
 def perturbed(

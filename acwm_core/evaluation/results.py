@@ -195,6 +195,35 @@ class Predictability:
 
 
 @dataclass(frozen=True)
+class Ensemble:
+    """What a model draws against the simulator's futures from starts that differ invisibly.
+
+    A frame's distance to another is the root mean square of their difference, of values in [0, 1].
+
+    Attributes:
+        clips: number of clips.
+        starts: number of the simulator's futures of each.
+        draws: number of the model's.
+        moved: standard deviation by which things were moved at the start, in m (joints in rad):
+            that of a place known to a pixel.
+        distance: energy distance to the simulator's futures, 0 for the same distribution, mean over
+            frames and clips: of the ``model``; of ``simulator``, one half of the futures against
+            the other, the floor; of ``codec``, its reconstructions of them; and of ``copy``, the
+            first frame.
+        spread: mean distance of two different futures, of the rows that have several.
+        curves: the distance of each frame, by row.
+    """
+
+    clips: int
+    starts: int
+    draws: int
+    moved: float
+    distance: dict[str, Estimate]
+    spread: dict[str, Estimate]
+    curves: dict[str, list[float | None]]
+
+
+@dataclass(frozen=True)
 class SplitSummary:
     """One test split.
 
@@ -264,6 +293,8 @@ class Summary:
         left_out: metrics of the recipe and tests that could not be measured, and episodes that
             could not be read, and why.
         published: published scores of the same setting or environment; None if there are none.
+        ensembles: the model's draws against the simulator's futures, per test split; empty if not
+            requested or not available.
     """
 
     run: str
@@ -278,6 +309,7 @@ class Summary:
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
     published: Published | None = None
+    ensembles: dict[str, Ensemble] = field(default_factory=dict[str, Ensemble])
 
     @property
     def handed_in(self) -> bool:

@@ -13,7 +13,6 @@ from scipy import stats
 from acwm_core.env.physics import Physics, Reading
 from acwm_core.evaluation.metric import Metric, Numbers, Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means
-from acwm_metrics.pose import positions_of
 from acwm_metrics.seen import exist, held_of, share_found
 
 DRAWS = "Draws"
@@ -99,20 +98,20 @@ class _Coverage(PhysicalMetric):
     group = DRAWS
 
     def lacking(self, physics: Physics) -> str | None:
-        return None if positions_of(physics) else "no position that is read"
+        return None if physics.positions else "no position that is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The share of covered coordinates, `[T]`; NaN in the given frame, or without draws."""
         if not prediction.draws:
             return np.full(len(prediction.target), np.nan)
-        readings = positions_of(physics_of(prediction))
+        readings = physics_of(prediction).positions
         covered = np.concatenate([self._covered(prediction, each) for each in readings], 1)
         covered[0] = np.nan
         return row_means(covered)
 
     def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
         """Share of the bodies and frames in which a place is found, in the mean over draws."""
-        readings = positions_of(physics_of(prediction))
+        readings = physics_of(prediction).positions
         found = [share_found(draw, readings) for draw in prediction.draws]
         return float(np.mean(found)) if found else float("nan")
 

@@ -40,15 +40,15 @@ class PositionError(PhysicalMetric):
     group = "States"
 
     def lacking(self, physics: Physics) -> str | None:
-        return None if positions_of(physics) else "no position that is read"
+        return None if physics.positions else "no position that is read"
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in m."""
-        return _mean_over_rows(prediction, positions_of(physics_of(prediction)))
+        return _mean_over_rows(prediction, physics_of(prediction).positions)
 
     def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
         """Share of the bodies and frames in which a place is found."""
-        return share_found(prediction, positions_of(physics_of(prediction)))
+        return share_found(prediction, physics_of(prediction).positions)
 
 
 class OrientationError(PhysicalMetric):
@@ -86,13 +86,8 @@ class PixelPositionError(PositionError):
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The distance in each frame, `[T]`, in pixels."""
-        readings = positions_of(physics_of(prediction))
+        readings = physics_of(prediction).positions
         return _mean_over_rows(prediction, readings, in_pixels=True)
-
-
-def positions_of(physics: Physics) -> list[Reading]:
-    """The readings that are positions in m, of bodies and of the points of curves."""
-    return _of(physics, "position", "curve")
 
 
 def _of(physics: Physics, *kinds: str) -> list[Reading]:

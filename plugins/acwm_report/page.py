@@ -47,6 +47,7 @@ TABLES: Mapping[str, Callable[[EvaluatedRun], list[Table]]] = {
     "scores": tables.score_tables,
     "states": tables.state_tables,
     "responses": tables.response_tables,
+    "ensembles": tables.ensemble_tables,
     "labels": tables.label_tables,
     "policies": rankings.ranking_tables,
     "plans": plans.plan_tables,

@@ -22,7 +22,15 @@ from acwm_report.comparison import compare_runs
 from acwm_report.draws import draws_phrase
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale, Table
-from acwm_report.titles import BESIDE, ROWS, branch_title, clips_title, label_title, split_title
+from acwm_report.titles import (
+    BESIDE,
+    ENSEMBLE_ROWS,
+    ROWS,
+    branch_title,
+    clips_title,
+    label_title,
+    split_title,
+)
 from acwm_report.videos import EmbeddedVideo
 
 
@@ -128,6 +136,32 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
         columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
         title = f"{split_title(split)} · {found.branches} branches of {found.clips} clips"
         tables.append(Table(title, columns, rows, "Other actions", name=f"response-{split}"))
+    return tables
+
+
+def ensemble_tables(run: EvaluatedRun) -> list[Table]:
+    """One table per split: distances of futures to the simulator's, and to each other."""
+    tables: list[Table] = []
+    for split, found in run.summary.ensembles.items():
+        values = [each.value for each in found.distance.values()]
+        scale = Scale.of(values, MetricInfo("", higher_is_better=False, factor=1000.0))
+        columns = [
+            Column("Energy distance", scale.unit, "↓", key="energy_distance"),
+            Column("Two futures differ by", scale.unit, key="spread"),
+        ]
+        rows = [
+            Row(
+                title, [Cell.of(of.get(kind), scale) for of in (found.distance, found.spread)], note
+            )
+            for kind, (title, note) in ENSEMBLE_ROWS.items()
+            if kind in found.distance
+        ]
+        title = f"{split_title(split)} · {found.clips} clips, {found.starts} starts"
+        about = (
+            f"Things start {1000 * found.moved:.2g} mm elsewhere (standard deviation; joints in "
+            f"mrad), which is what a pixel resolves. The model makes {found.draws} of each clip."
+        )
+        tables.append(Table(title, columns, rows, "Futures", about, f"ensemble-{split}"))
     return tables
 
 

@@ -16,7 +16,13 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from acwm_core.evaluation.protocol import PublishedRow
-    from acwm_core.evaluation.results import Counterfactual, Estimate, SetSummary, Summary
+    from acwm_core.evaluation.results import (
+        Counterfactual,
+        Ensemble,
+        Estimate,
+        SetSummary,
+        Summary,
+    )
     from acwm_report.comparison import Comparison, Difference
     from acwm_severity.curves import SeverityCurve
 
@@ -155,6 +161,22 @@ def _print_curves(summary: Summary) -> None:
             until = "beyond the last frame" if horizon is None else f"frame {horizon}"
             clips = f"{result.predictability.clips} clips, started a millimetre off"
             click.echo(f"{split}: predictability horizon: {until} ({clips})")
+    for split, found in summary.ensembles.items():
+        _print_ensemble(split, found)
+
+
+def _print_ensemble(split: str, found: Ensemble) -> None:
+    named = {**ROWS, "simulator": "simulator, half against half"}
+    away, apart = (
+        ", ".join(f"{named[row]} {_text(each, interval=False)}" for row, each in of.items())
+        for of in (found.distance, found.spread)
+    )
+    drawn = f"{found.draws} draws" if found.draws > 1 else "one prediction"
+    click.echo(
+        f"{split}: energy distance to the simulator's futures from {found.starts} starts, "
+        f"{1000 * found.moved:.2g} mm off, of {found.clips} clips ({drawn}): {away}"
+    )
+    click.echo(f"{split}: mean distance of two futures: {apart}".replace(", half against half", ""))
 
 
 def _print_action_response(split: str, found: Counterfactual) -> None:

@@ -38,6 +38,15 @@ BESIDE = {
 """Short titles of the rows where they are table columns: the scores first, then their floors."""
 
 
+ENSEMBLE_ROWS = {
+    "simulator": ("Simulator", "the floor: one half of its futures against the other"),
+    "codec": ("Codec reconstruction", "of the simulator’s futures: the least with this codec"),
+    "model": ("Model", "what is being evaluated"),
+    "copy": ("First frame, copied", "a future in which nothing moves"),
+}
+"""Title and explanation of what is compared with the simulator's futures, in table order."""
+
+
 OVER = {"copy": "the copied first frame", "shuffled": "other actions"}
 """The baselines that a model is compared with on each clip."""
 
