@@ -1,6 +1,6 @@
 """Reconstruction PSNR of a codec in every environment, at 64×64 and at the environment's own size.
 
-    python benchmarks/codec.py                                  # the table in docs/findings/codecs.md
+    python benchmarks/codec.py                             # the table in docs/findings/codecs.md
     python benchmarks/codec.py compact weights=mine.safetensors
     python benchmarks/codec.py identity --only push_cube --only reacher
 
