@@ -14,6 +14,23 @@ from acwm_core.files import disk_error
 from acwm_planning.controllers import NoSolutionError
 
 
+def _is_shared(error: Exception) -> bool:
+    """Whether an error is of the settings, the disk or acwm, so that no episode would do better."""
+    return bool(isinstance(error, RecipeError) or disk_error(error)) or not is_for_users(error)
+
+
+@contextlib.contextmanager
+def passed_over() -> Generator[None]:
+    """Pass over an episode that fails in the block, which will be told where it counts."""
+    try:
+        yield
+    except SolvedAtStartError:
+        pass
+    except Exception as error:
+        if _is_shared(error):
+            raise
+
+
 @dataclass
 class LeftOut:
     """What was left out.
@@ -45,8 +62,7 @@ class LeftOut:
             self.solved.add(seed)
             self._tell(f"{error}: it is left out", error)
         except Exception as error:
-            shared = isinstance(error, RecipeError) or disk_error(error)
-            if shared or not is_for_users(error):
+            if _is_shared(error):
                 raise
             self.failed[row, seed] = sentence(error)
             self._tell(f"{row} with seed {seed} is left out: {sentence(error)}", error)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -13,7 +12,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
+from acwm_core.env.task import Task, TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import duration
@@ -29,7 +28,7 @@ from acwm_planning.controllers import (
 )
 from acwm_planning.episode import EpisodeResult, TaskVariant, play, spec_of_seed
 from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.left_out import LeftOut
+from acwm_planning.left_out import LeftOut, passed_over
 from acwm_planning.page import write_page
 from acwm_planning.planner import Cost, Planner
 from acwm_planning.resumable import Line, ResumableResults
@@ -102,21 +101,22 @@ class EpisodePlayer:
     def estimate(self, episodes: Sequence[tuple[str, int]]) -> str:
         """How long it takes at most to play these, rows and seeds, from a decision of each planner.
 
-        Episodes that are solved end earlier, and those without a planner take little.
+        Episodes that are solved end earlier, and those without a planner take little. It is empty
+        if no planner decides anything.
         """
         counts = Counter(row for row, _ in episodes if row in PLANNED_ROWS)
         spec, seconds = spec_of_seed(self.card, episodes[0][1]), 0.0
         for row, count in counts.items():
             controller = self.controller(row)
             assert isinstance(controller, PlanningController)
-            with contextlib.suppress(SolvedAtStartError):
+            with passed_over():
                 frame, _ = self.environment.reset(options={"spec": spec})
                 parts = self.environment.environment, self.environment.task
                 controller.begin(*parts, self.environment.goal)
                 taken = len(controller.act(History(spec, [frame])))
                 decisions = -(-self.environment.task.max_steps // taken)
                 seconds += count * decisions * controller.decisions[0].seconds
-        return f"at most about {duration(seconds)} for {len(episodes)} episodes"
+        return f"at most about {duration(seconds)} for {len(episodes)} episodes" if seconds else ""
 
     def write_video(
         self, folder: Path, row: str, seed: int, result: EpisodeResult, controller: Controller
@@ -222,8 +222,8 @@ def plan_episodes(
     try:
         with results.adding():
             missing = [*missing_episodes(rows, seeds, results.finished())]
-            if len(missing) > 1:
-                tell(player.estimate(missing))
+            if len(missing) > 1 and (about := player.estimate(missing)):
+                tell(about)
             for row, seed in missing:
                 if row in left.rows or seed in left.solved:
                     continue

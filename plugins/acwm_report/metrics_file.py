@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
+import pyarrow  # pyright: ignore[reportMissingTypeStubs]
 from numpy.typing import NDArray
-from pyarrow import csv
+from pyarrow import compute, csv  # pyright: ignore
+
+# They have no types.
+_arrow, _compute, _csv = cast(Any, pyarrow), cast(Any, compute), cast(Any, csv)
 
 POINTS = 4000
 """Most points of a curve; of more, as many successive ones are averaged as makes it fewer."""
@@ -26,37 +28,42 @@ def logged(run: Path, column: str) -> tuple[list[float], list[float]]:
     file = run / "metrics.csv"
     if not file.exists():
         return [], []
-    parts = [np.zeros((0, 2)), *_chunks(file, column)]
-    rows = np.concatenate(parts)
-    together = -(-len(rows) // POINTS) or 1
-    starts = np.arange(0, len(rows), together)
-    counts = np.diff([*starts, len(rows)])
-    means = np.add.reduceat(rows, starts) / counts[:, None] if together > 1 else rows
-    return means[:, 0].tolist(), means[:, 1].tolist()
+    rows: NDArray[np.float64] = np.concatenate([np.zeros((0, 2)), *_chunks(file, column)])
+    together = -(-len(rows) // POINTS)
+    if together > 1:
+        starts = np.arange(0, len(rows), together)
+        counts = np.diff(starts, append=len(rows))
+        rows = cast(Any, np.add).reduceat(rows, starts) / counts[:, None]
+    return rows[:, 0].tolist(), rows[:, 1].tolist()
+
+
+def _skip(row: Any) -> str:
+    return "skip"
 
 
 def _chunks(file: Path, column: str) -> Iterator[NDArray[np.float64]]:
     """Step and value of the rows that have both, `[n, 2]`, some thousands at a time."""
-    library = cast(Any, csv)
     columns = ["step", column]
     options = {
-        "parse_options": library.ParseOptions(invalid_row_handler=lambda row: "skip"),
-        "convert_options": library.ConvertOptions(
-            include_columns=columns, column_types=dict.fromkeys(columns, pa.string())
+        "parse_options": _csv.ParseOptions(invalid_row_handler=_skip),
+        "convert_options": _csv.ConvertOptions(
+            include_columns=columns, column_types=dict.fromkeys(columns, _arrow.string())
         ),
     }
     try:
-        for batch in library.open_csv(file, **options):
+        for batch in _csv.open_csv(file, **options):
             yield _numbers(batch)
-    except (pa.ArrowInvalid, pa.ArrowKeyError):  # it has no such column, or no row at all
+    except (_arrow.ArrowInvalid, _arrow.ArrowKeyError):  # it has no such column, or no row at all
         return
 
 
 def _numbers(batch: Any) -> NDArray[np.float64]:
-    library, kept = cast(Any, pc), None
+    kept: Any = None
     for column in batch.columns:
-        is_number = library.match_substring_regex(column, NUMBER)
-        kept = is_number if kept is None else library.and_(kept, is_number)
+        is_number = _compute.match_substring_regex(column, NUMBER)
+        kept = is_number if kept is None else _compute.and_(kept, is_number)
     sound = batch.filter(kept)
-    trimmed = (library.utf8_trim_whitespace(column) for column in sound.columns)
-    return np.stack([each.cast(pa.float64()).to_numpy(zero_copy_only=False) for each in trimmed], 1)
+    trimmed = (_compute.utf8_trim_whitespace(column) for column in sound.columns)
+    return np.stack(
+        [each.cast(_arrow.float64()).to_numpy(zero_copy_only=False) for each in trimmed], 1
+    )

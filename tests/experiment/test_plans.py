@@ -46,7 +46,7 @@ def plan(tmp_path, text=FILE, overrides=(), seeds=None):
 def test_a_file_becomes_commands_that_one_would_type(tmp_path):
     made = plan(tmp_path)
     steps = {step.name: step for step in all_steps(made)}
-    own = "push_cube+small-0-place,past=1,planner.candidates=9"
+    own = "push_cube+small-0-place-past-1-planner.candidates-9"
     step = steps[f"plan-{own}"]
     assert (step.kind, step.needs) == ("plan", ("train-push_cube+small-0",))
     assert step.title == "plan Ours · Cube · seed 0"
@@ -152,7 +152,7 @@ plans:
     tasks: {{Narrow: narrow corner {QUICK}}}
 """
 
-NAME = f"tiny-0-corner,{QUICK.replace(' ', ',')}"
+NAME = f"tiny-0-corner-{QUICK.replace(' ', '-').replace('=', '-')}"
 
 STEPS = 5  # one dataset, training, evaluation and plan, a report
 

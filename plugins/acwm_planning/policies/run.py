@@ -28,7 +28,7 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.episode import spec_of_seed
-from acwm_planning.left_out import LeftOut
+from acwm_planning.left_out import LeftOut, passed_over
 from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, read_outcome
 from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
@@ -256,8 +256,9 @@ def _roll_out(
     with progress_bar(what, total, done=total - count, shown=progress) as advance:
         left = [seed for seed, names in missing.items() if names]
         if progress and left:
-            about = duration(len(left) * ranker.seconds(left))
-            print(f"about {about} for {len(left)} starts", file=sys.stderr, flush=True)
+            with passed_over():
+                about = duration(len(left) * ranker.seconds(left))
+                print(f"about {about} for {len(left)} starts", file=sys.stderr, flush=True)
         for seed in left:
             with ranker.left.trying("every policy", seed):
                 results.add(*ranker.lines(seed, missing[seed]))
