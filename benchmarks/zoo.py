@@ -23,7 +23,7 @@ from acwm_core.evaluation.results import SetSummary, Summary
 from acwm_core.evaluation.shares import error_shares
 from acwm_core.training.run import load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
-from acwm_formats.preview import Picture, below, beside, magnified
+from acwm_formats.sheets import Picture, below, beside, magnified
 from acwm_zoo.shipped import folder, shipped
 
 SPLITS = ("ind_test", "ood_test")

@@ -17,7 +17,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import EpisodeSpec, Factor, FactorSetting, Split
 from acwm_core.errors import AcwmError
-from acwm_formats.preview import GAP, Label, Picture, contact_sheet, play_together
+from acwm_formats.sheets import GAP, Label, Picture, contact_sheet, play_together
 
 DOCS = Path(__file__).resolve().parent
 PICTURES = DOCS / "environments"

@@ -9,7 +9,7 @@ from environments_text import ORDER
 from PIL import Image
 
 from acwm_core.data.simulate import make_environment
-from acwm_formats.preview import Label, play_together
+from acwm_formats.sheets import Label, play_together
 
 OUT = DOCS / "worlds.webp"
 SIDE, FRAMES, EVERY, FPS, QUALITY = 160, 40, 2, 10, 60

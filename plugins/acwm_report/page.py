@@ -21,6 +21,7 @@ from acwm_report.comparison import run_labels
 from acwm_report.experiment import experiment_tables
 from acwm_report.export import file_name, templates, to_csv, to_latex, to_markdown
 from acwm_report.figures import Chart
+from acwm_report.opening import main_figures, opening
 from acwm_report.plan_videos import VideoRoom, plan_videos, task_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
@@ -89,7 +90,7 @@ def _drawn(
     """Draw the page of the readable runs; it says why the others cannot be read."""
     found, experiment = _read(folders), experiment and experiment.of_runs(folders)
     many = len(found) > 3  # then each run's section is folded up
-    names, videos = " · ".join(each.summary.run for each in found), embed_videos(found, megabytes)
+    videos = embed_videos(found, megabytes)
     used = sum(len(video.data) for each in videos for video in each) / 1e6
     room = VideoRoom(megabytes - used)
     return drawn_page(
@@ -104,7 +105,8 @@ def _drawn(
         main=_main_table(found, experiment),
         differences=_differences(found),
         experiment=_experiment_tables(found, experiment),
-        title=experiment.title if experiment else f"{len(found)} runs compared" if many else names,
+        opened=1 if many or experiment is not None else len(found),
+        title=experiment.title if experiment else f"{len(found)} runs compared",
         folded=many or experiment is not None,
         tables=TABLES,
         charts=CHARTS,
@@ -194,12 +196,13 @@ def drawn_page(template: str, **content: Any) -> str:
     made.filters["quote"] = shlex.quote
     made.globals.update(
         action_traces=action_traces,
-        baselines=titles.OVER,
         branch_title=titles.branch_title,
         commands_of=commands,
         episode_table=tables.episode_table,
         label_title=titles.label_title,
         outdated_curves=charts.outdated_curves,
+        figures_of=main_figures,
+        opening_of=opening,
         split_title=titles.split_title,
         version=acwm_core.__version__,
     )

@@ -68,18 +68,19 @@ class EvaluatedRun:
         """Whether the model beats both baselines, by the intervals of the first split."""
         gains = self.gains(next(iter(self.summary.splits.values())).scores)
         if all(gain.low is None for gain in gains.values()):
-            return "Too few episodes for a verdict"
+            return "Too few episodes for a verdict."
         better = {each: (gain.low or 0) > 0 for each, gain in gains.items()}
         if "shuffled" not in better:
-            return f"{'Better' if better['copy'] else 'No better'} than a still frame"
+            how = "beats" if better["copy"] else "is no better than"
+            return f"The prediction {how} a still picture."
         predicts, conditioned = better["copy"], better["shuffled"]
         if predicts and conditioned:
-            return "Action-conditioned prediction"
+            return "The prediction follows the actions, and beats a still picture."
         if conditioned:
-            return "Action-conditioned, but no better than a still frame"
+            return "The prediction follows the actions, but is no better than a still picture."
         if predicts:
-            return "Better than a still frame, but action-insensitive"
-        return "No better than a still frame, and action-insensitive"
+            return "The prediction beats a still picture, but is action-insensitive."
+        return "The prediction is no better than a still picture, and action-insensitive."
 
     def metrics(self, reads: str) -> list[str]:
         """Names of the metrics that read ``"pixels"``, or those that read ``"states"``."""

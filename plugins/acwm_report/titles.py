@@ -47,7 +47,7 @@ ENSEMBLE_ROWS = {
 """Title and explanation of what is compared with the simulator's futures, in table order."""
 
 
-OVER = {"copy": "the copied first frame", "shuffled": "other actions"}
+OVER = {"copy": "the copied first frame", "shuffled": "the same model with other actions"}
 """The baselines that a model is compared with on each clip."""
 
 

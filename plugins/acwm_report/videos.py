@@ -45,7 +45,7 @@ def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Em
 
     Videos are taken by priority, then by run: median clips before worst and best clips, before
     clips with other actions. A video that does not fit into the remaining space is skipped.
-    The result is in page order: the median clip comes last, beside its version with other actions.
+    The result is in page order: best, median and worst, then the median with other actions.
 
     Raises:
         DataError: a video is missing.
@@ -68,7 +68,7 @@ def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Em
             chosen[number].append(EmbeddedVideo(key, record, path.read_bytes()))
     for run, videos in zip(runs, chosen, strict=True):
         videos.sort(key=lambda each, order=run.summary.videos: order.index(each.record))
-        videos.sort(key=lambda v: (v.record.pick == "median", v.record.kind != "model"))
+        videos.sort(key=lambda each: each.record.kind != "model")
     return chosen
 
 

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
-from acwm_formats.preview import (
+from acwm_core.env.card import ActionSpec
+from acwm_formats.sheets import (
     ACCENT,
     GAP,
     LINE_HEIGHT,
     MAX_WIDTH,
     Label,
+    action_shares,
     below,
     contact_sheet,
     magnified,
@@ -105,3 +107,9 @@ def test_rows_of_unequal_width_share_a_page():
     page = below([np.zeros((4, 10, 3), np.uint8), np.zeros((4, 6, 3), np.uint8)])
     assert page.shape == (8 + GAP, 10, 3)
     assert (page[-1, 6:] == 255).all()
+
+
+def test_actions_stand_within_their_bounds_and_the_last_one_is_that_before():
+    spec = ActionSpec(("x", "y"), ("", ""), (-1, 0), (1, 4), "absolute")
+    shares = action_shares(np.array([[1, 0], [0, 1], [0, 0]], np.float32), spec)
+    np.testing.assert_allclose(shares, [[0, 1], [0.5, 0.75], [0.5, 0.75]])

@@ -4,12 +4,15 @@ import json
 import shutil
 
 import av
+import numpy as np
 import pytest
 from conftest import EPISODES
 from PIL import Image
 
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats.preview import describe, preview
+from acwm_formats.sheets import CURVES
 
 
 def test_the_facts_agree_with_the_files(square_data):
@@ -35,17 +38,22 @@ def test_an_unfinished_dataset_can_be_described(square_data, tmp_path):
         preview(tmp_path / "data", tmp_path / "out")
 
 
-def test_the_preview_shows_every_split(square_data, tmp_path):
+def test_the_preview_shows_every_split_with_masks_and_actions(square_data, tmp_path):
     sheet, film = preview(square_data, tmp_path / "a/b", episodes=3, columns=5)
     picture = Image.open(sheet)
     frame, gap, label = 160, 6, 20  # frames of 32 are drawn five times as large
-    assert picture.size == (5 * frame + 4 * gap, 8 * (frame + label) + 7 * gap)
+    row, legends = label + 2 * frame + CURVES, 2 * (gap + label)
+    assert picture.size == (5 * frame + 4 * gap, 8 * row + 7 * gap + legends)
+    mask = EpisodeDataset(square_data, "train")[0].masks[0]
+    below = np.asarray(picture)[label + frame : label + 2 * frame, :frame].astype(int)[2::5, 2::5]
+    blue = below[..., 2] - below[..., 0]  # the first instance is blue, all else is not
+    assert blue[mask == 1].min() > 80 > blue[mask == 0].max()
     with av.open(str(film)) as container:
         frames = list(container.decode(container.streams.video[0]))
     assert len(frames) == 21
     assert (frames[0].width, frames[0].height) == (
-        3 * frame + 2 * gap,
-        3 * (frame + label) + 2 * gap,
+        3 * 2 * frame + 2 * gap,
+        3 * (frame + label + CURVES) + 2 * gap + legends,
     )
 
 

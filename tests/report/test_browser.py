@@ -38,7 +38,8 @@ def pages(tmp_path_factory):
         environment = "drift" if number < 4 else "reacher"
         name = f"push_cube_cross_attention_with_a_long_name+small-{number}"
         runs.append(synthetic.run(root / name, rows, environment=environment))
-    add_video(runs[0])
+    add_video(runs[0], masked=True)
+    add_video(runs[1], masked=False)
     add_plans(runs[0])
     one = write_report(runs[:1], root / "one.html")
     many = write_report(runs, root / "many.html")
@@ -46,14 +47,16 @@ def pages(tmp_path_factory):
     return {"one": one, "many": many, "board": board}
 
 
-def add_video(run):
-    """Give a run a video of its third clip."""
+def add_video(run, masked):
+    """Give a run a video of its third clip: red grows brighter, and is predicted as fading blue."""
     import torch
 
     from acwm_core.data.video import write_mp4
 
-    clip, masks = torch.rand(5, 3, 16, 16), np.ones((5, 16, 16), np.uint8)
-    names, frames = case_study(clip, clip.flip(0), masks)
+    shades = torch.linspace(0.5, 1, 5)[:, None, None].expand(5, 32, 32)
+    truth, prediction = torch.zeros(2, 5, 3, 32, 32)
+    truth[:, 0], prediction[:, 2] = shades, shades.flip(0)
+    names, frames = case_study(truth, prediction, np.full((5, 32, 32), masked, np.uint8))
     record = VideoRecord(
         file="ind_test-000003-model.mp4",
         split="ind_test",
@@ -149,8 +152,85 @@ def test_a_row_leads_to_its_video_which_plays(browser, pages):
     video.scroll_into_view_if_needed()
     assert video.bounding_box()["y"] < DESK["height"]
     wait_until(page, "document.querySelector('video').readyState >= 2")
-    assert video.evaluate("each => each.videoWidth") == 4 * (2 * 16 + 2)
+    assert video.evaluate("each => each.videoWidth") == 4 * (2 * 32 + 2)
     assert problems == []
+    page.context.close()
+
+
+PIXELS = """each => {
+  const { data } = each.getContext('2d').getImageData(0, 0, each.width, each.height);
+  return [...data].filter((_, k) => k % 4 < 3);
+}"""
+PLAYING = "[...document.querySelectorAll('video')].filter(each => !each.paused).length"
+
+
+def pixels(canvas):
+    """The pixels of a canvas, `[H * W, 3]`."""
+    return np.array(canvas.evaluate(PIXELS)).reshape(-1, 3)
+
+
+def test_the_first_screen_moves_and_tells_three_figures(browser, pages):
+    page, _ = visit(browser, pages["one"], DESK)
+    panels = page.locator("header canvas").all()
+    figures = page.locator("header .figures div").all()
+    assert [len(panels), len(figures)] == [3, 3]
+    for each in [*panels, *figures, page.locator("h1"), page.get_by_role("button", name="Pause")]:
+        box = each.bounding_box()
+        assert box["y"] + box["height"] <= DESK["height"]
+    truth = set()
+    for _ in range(200):
+        truth.add(int(pixels(panels[0])[:, 0].mean().round(-1)))
+        if len(truth) > 2:
+            break
+        page.wait_for_timeout(50)
+    assert len(truth) > 2, "the truth does not move"
+    page.context.close()
+
+
+@pytest.mark.parametrize("run", ["run1", "run2"])
+def test_panels_are_cut_out_of_videos_with_and_without_masks(browser, pages, run):
+    page, _ = visit(browser, pages["many"], DESK)
+    truth, prediction, _ = page.locator(f".moving[data-of^='{run}-'] canvas").all()
+    truth.scroll_into_view_if_needed()
+    for _ in range(200):
+        red, blue = pixels(truth), pixels(prediction)
+        if red.any() and blue.any():
+            break
+        page.wait_for_timeout(50)
+    assert red[:, 0].min() > 100
+    assert red[:, 1:].max() < 40
+    assert blue[:, 2].min() > 100
+    assert blue[:, :2].max() < 40
+    page.context.close()
+
+
+def test_one_button_plays_and_pauses_all_videos_also_with_keys(browser, pages):
+    page, problems = visit(browser, pages["one"], {"width": 1280, "height": 20000})
+    for details in page.locator("details").all():
+        details.evaluate("each => { each.open = true; }")
+    count = page.locator("video").count()
+    assert count == 2
+    assert page.get_by_role("group", name="All videos").get_by_role("button").count() == 1
+    assert not page.evaluate("[...document.querySelectorAll('video')].some(each => each.controls)")
+    wait_until(page, f"{PLAYING} === {count}")
+    page.get_by_role("button", name="Pause").focus()
+    page.keyboard.press("Space")
+    wait_until(page, f"{PLAYING} === 0")
+    slider = page.get_by_label("Place in the videos")
+    slider.fill("0.5")
+    share = "document.querySelector('video').currentTime / document.querySelector('video').duration"
+    wait_until(page, f"Math.abs({share} - 0.5) < 0.1")
+    page.get_by_role("button", name="Play").focus()
+    page.keyboard.press("Enter")
+    wait_until(page, f"{PLAYING} === {count}")
+    assert problems == []
+    page.context.close()
+
+
+def test_who_asked_for_less_motion_begins_with_still_pictures(browser, pages):
+    page, _ = visit(browser, pages["one"], DESK, reduced_motion="reduce")
+    assert page.get_by_role("button", name="Play").count() == 1
+    assert page.evaluate(PLAYING) == 0
     page.context.close()
 
 
@@ -162,6 +242,8 @@ def test_links_to_folded_runs_and_pages_without_scripts(browser, pages):
     page.context.close()
     page, problems = visit(browser, pages["one"], PHONE, java_script_enabled=False)
     assert page.locator("table[data-sortable] tbody tr").count() == 24
+    assert page.locator("video[controls]").first.is_visible()
+    assert not page.locator(".player, .moving").first.is_visible()
     assert problems == []
     page.context.close()
 

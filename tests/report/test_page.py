@@ -20,10 +20,11 @@ from acwm_core.evaluation.results import (
 )
 from acwm_core.evaluation.statistics import paired_bootstrap
 from acwm_report.charts import smooth
+from acwm_report.opening import opening
 from acwm_report.page import write_report
 from acwm_report.run import EvaluatedRun
 from acwm_report.table import Scale
-from acwm_report.videos import action_traces
+from acwm_report.videos import action_traces, embed_videos
 from tests.report import synthetic
 
 CLIPS = synthetic.clips(np.linspace(20, 26, 4))
@@ -91,7 +92,7 @@ def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
     assert len(videos) == len(records)
     assert sum(record.kind in ("model", "shuffled") for record in records) == 8
     for video in videos:
-        assert {"controls", "loop", "muted", "autoplay", "playsinline"} <= set(video)
+        assert {"controls", "loop", "muted", "playsinline"} <= set(video)
         data = base64.b64decode(video["src"].removeprefix("data:video/mp4;base64,"))
         with av.open(io.BytesIO(data)) as file:
             stream = file.streams.video[0]
@@ -101,6 +102,19 @@ def test_every_video_plays_and_has_the_frames_of_its_clip(page, evaluated):
         assert len(frames) == 9
         sides = {str(each.shape) for each in frames}
         assert sides <= {str((264, 264, 3)), str((128, 400, 3))}  # two by two, or three in a row
+
+
+def test_clips_stand_from_best_to_worst_and_the_page_begins_with_the_median(evaluated):
+    run = EvaluatedRun.read(evaluated, "run1")
+    (videos,) = embed_videos([run], 16)
+    for split in run.summary.splits:
+        picks = [(v.record.pick, v.record.kind) for v in videos if v.record.split == split]
+        own = [(pick, "model") for pick in ("best", "median", "worst")]
+        assert [*own, ("median", "shuffled")] == [each for each in picks if "branch" not in each[1]]
+    shown = opening(run, videos)
+    assert shown
+    assert (shown.video.record.split, shown.video.record.pick) == ("ind_test", "median")
+    assert opening(run, []) is None
 
 
 def test_the_numbers_of_the_summary_are_on_the_page(page, evaluated):
@@ -140,7 +154,7 @@ def test_by_default_the_report_lies_in_the_run_and_names_are_escaped(tmp_path):
     run = synthetic.run(tmp_path / "<script>alert(1)<", CLIPS)
     assert write_report([run]) == run / "report.html"
     page = (run / "report.html").read_text(encoding="utf-8")
-    assert "with the true actions" in page
+    assert "PSNR of the prediction" in page
     assert "<script>alert" not in page
     assert "How many sampling steps" not in page  # nothing was swept
 
@@ -176,11 +190,23 @@ def run_of(copy, shuffled):
 @pytest.mark.parametrize(
     ("copy", "shuffled", "title"),
     [
-        ((3, 2, 4), (2, 1, 3), "Action-conditioned prediction"),
-        ((-1, -2, 0), (2, 1, 3), "Action-conditioned, but no better than a still frame"),
-        ((3, 2, 4), (0.1, -1, 1), "Better than a still frame, but action-insensitive"),
-        ((-1, -2, 0), (0, -1, 1), "No better than a still frame, and action-insensitive"),
-        ((3, None, None), (2, None, None), "Too few episodes for a verdict"),
+        ((3, 2, 4), (2, 1, 3), "The prediction follows the actions, and beats a still picture."),
+        (
+            (-1, -2, 0),
+            (2, 1, 3),
+            "The prediction follows the actions, but is no better than a still picture.",
+        ),
+        (
+            (3, 2, 4),
+            (0.1, -1, 1),
+            "The prediction beats a still picture, but is action-insensitive.",
+        ),
+        (
+            (-1, -2, 0),
+            (0, -1, 1),
+            "The prediction is no better than a still picture, and action-insensitive.",
+        ),
+        ((3, None, None), (2, None, None), "Too few episodes for a verdict."),
     ],
 )
 def test_the_verdict_needs_intervals_beyond_zero(copy, shuffled, title):
@@ -199,7 +225,9 @@ def test_the_verdict_rests_on_the_intervals_of_acwm_compare(tmp_path):
     test = paired_bootstrap(gains)
     assert (gain.value, gain.low, gain.high) == pytest.approx((test.mean, test.low, test.high))
     assert gain.low < 0
-    assert run.verdict == "Action-conditioned, but no better than a still frame"
+    assert (
+        run.verdict == "The prediction follows the actions, but is no better than a still picture."
+    )
 
 
 @pytest.mark.parametrize(
