@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from acwm_play.live_world import LiveWorld
+from acwm_play.simulator import Scene
 from acwm_play.workers import Workers
 from acwm_play.worlds import World
 
@@ -34,8 +35,12 @@ class WorldPool:
         return [(name, world.environment) for name, world in self.worlds.items()]
 
     async def warm_up(self) -> None:
-        """Set up the first world, so that its errors are reported before the page is served."""
+        """Set up the first world and a scene of it before the page is served.
+
+        So errors are reported at once, and the page has pictures as soon as it is open.
+        """
         self._spare = await LiveWorld.create(next(iter(self.worlds.values())), self.workers)
+        await self._spare.begin(Scene(0))
 
     async def acquire(self, world: World) -> LiveWorld:
         """A running world, for one session."""

@@ -120,7 +120,7 @@ def _write(folder: Path, parts: Mapping[str, bytes]) -> None:
     loads = "\n".join(f'<script src="{each}" defer></script>' for each in scripts)
     for old, new in (
         (SERVED, loads),
-        ("<body>", '<body class="exported recorded busy">'),
+        ('<body class="busy">', '<body class="exported recorded busy">'),
     ):
         assert page.count(old) == 1, old
         page = page.replace(old, new)

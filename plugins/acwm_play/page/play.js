@@ -22,6 +22,7 @@ let socket = null, world = null, tries = 0, seq = 0, lastSent = "", hiddenPause 
 let state = { paused: false, speed: 1, driver: "you", recording: false };
 let queue = [], shownAt = 0, pace = 0, shownTimes = [], sentAt = new Map(), latency = null;
 let values = [], places = [], pushes = new Map(); // pushes: by dimension, from sticks, −1 to 1
+let entered = false; // whether the frames that come are of the world that was asked for
 let history = {}, fresh = true, lastKeys = new Set(), padButtons = [];
 
 // The socket --------------------------------------------------------------------------------------
@@ -90,9 +91,11 @@ function link(kind, text) {
   $("link-text").textContent = text;
 }
 
+// While a world is set up there is nothing to see, so its progress stands in place of the pictures.
 function busy(text) {
   document.body.classList.add("busy");
-  $("summary").textContent = text;
+  entered = false;
+  $("setup-text").textContent = text;
   link("busy", "setting up");
 }
 
@@ -159,6 +162,7 @@ function difference({ sim, model }) {
 function play(now) {
   requestAnimationFrame(play);
   pad();
+  if (!entered) queue = [];
   if (!queue.length) return;
   const due = 1000 / queue[0].fps / state.speed;
   const interval = clamp(pace * 1000, due, 3 * due) * (queue.length > world.stride ? 0.9 : 1);
@@ -169,6 +173,7 @@ function play(now) {
   draw($("model"), frame.model, frame);
   if (frame.compared) draw($("diff"), difference(frame), frame);
   document.body.classList.toggle("uncompared", !frame.compared);
+  document.body.classList.remove("busy");
   if (sentAt.has(frame.seq)) {
     const took = (now - sentAt.get(frame.seq)) / 1000;
     latency = latency === null ? took : 0.7 * latency + 0.3 * took;
@@ -288,7 +293,7 @@ function enter(about) {
   const another = !world || world.name !== about.name;
   world = about;
   [queue, history, fresh, latency] = [[], {}, true, null];
-  document.body.classList.remove("busy");
+  entered = true;
   sentAt.clear();
   pushes.clear();
   values = [...about.rest];

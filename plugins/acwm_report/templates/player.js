@@ -54,7 +54,6 @@ if (player) {
     for (const movie of movies) if (on.has(movie)) follow(movie, seconds()); else movie.pause();
     shown.forEach(draw);
     if (playing && first.duration) slider.value = (seconds() % first.duration) / first.duration;
-    player.classList.toggle("idle", !shown.size);
     if (playing) requestAnimationFrame(step);
   }
 
@@ -81,6 +80,7 @@ if (player) {
   player.hidden = false;
   const watcher = new IntersectionObserver((entries) => {
     for (const { target, isIntersecting } of entries) shown[isIntersecting ? "add" : "delete"](target);
+    player.classList.toggle("idle", !shown.size);
     if (!playing) step();
   }, { threshold: 0.1 });
   pictures.forEach((each) => watcher.observe(each));
