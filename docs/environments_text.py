@@ -49,24 +49,24 @@ def families(found: dict[str, EnvironmentCard]) -> dict[str, list[str]]:
 
 
 def overview(found: dict[str, EnvironmentCard]) -> str:
-    """The table of all environments that are not variants."""
-    rows = []
-    for name in families(found):
-        card = found[name]
-        rows.append(
-            (
-                f"[{name}](#{name})",
-                card.summary,
-                card.engine,
-                f"{card.action.size}, {card.action.kind}",
-                str(card.horizon),
-                _size(card),
-                _episodes(card),
-                ", ".join(card.ood_shifts),
-            )
-        )
-    head = ("World", "What happens", "Engine", "Action", "Frames", "Size", "Episodes", "OoD shifts")
-    return _table(head, rows)
+    """The tables of all environments that are not variants: what happens, and what is generated."""
+    shown = {f"[{name}](#{name})": found[name] for name in families(found)}
+    worlds = [
+        (name, card.summary, card.engine, f"{card.action.size}, {card.action.kind}")
+        for name, card in shown.items()
+    ]
+    defaults = [
+        (name, str(card.horizon), _size(card), _episodes(card), ", ".join(card.ood_shifts))
+        for name, card in shown.items()
+    ]
+    return "\n\n".join(
+        [
+            _table(("World", "What happens", "Engine", "Action"), worlds),
+            "Defaults of `acwm generate`, with episodes of `train` / `ind_test` / `ood_test`; "
+            "options change them:",
+            _table(("World", "Frames", "Size", "Episodes", "OoD shifts"), defaults),
+        ]
+    )
 
 
 def sections(found: dict[str, EnvironmentCard]) -> str:
