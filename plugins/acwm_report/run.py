@@ -54,10 +54,13 @@ class EvaluatedRun:
         return replace(scale, decimals=max(1, scale.decimals - 1))
 
     def gains(self, scores: SetSummary) -> dict[str, Estimate]:
-        """The model's advantage over each baseline in the headline metric; positive is better."""
+        """The model's advantage over each baseline in the headline metric; positive is better.
+
+        Predictions that were handed in have none over other actions.
+        """
         sign = 1 if self.headline.higher_is_better else -1
         found: dict[str, Estimate] = {}
-        for each in (name for name in OVER if name in scores.paired):
+        for each in (name for name in OVER if name != "shuffled" or name in scores.paired):
             was = scores.paired[each][self.summary.headline].difference
             ends = (was.value, *(was.low, was.high)[::sign])
             found[each] = Estimate(*(None if end is None else sign * end for end in ends))

@@ -45,7 +45,7 @@ def page_of(*words, out):
 
 def test_a_report_is_made_of_scores(home, tmp_path):
     _, words = page_of("report", home / "squares/slide", out=tmp_path / "report.html")
-    assert "than a still frame" in words
+    assert "a still picture" in words
     assert "predictions that were handed in, 1,200,000 parameters" in words
     assert "acwm score" in words
     assert "another episode’s actions" not in words.partition("The numbers")[0]

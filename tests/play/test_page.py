@@ -22,6 +22,33 @@ def white(page):
     return columns.mean() / 64 if len(columns) else np.nan
 
 
+WATCH = """() => {
+  const look = () => {
+    const board = document.querySelector('.board'), sim = document.getElementById('sim');
+    if (board && board.checkVisibility()) {
+      const { data } = sim.getContext('2d').getImageData(0, 0, sim.width, sim.height);
+      window.looks = (window.looks || 0) + 1;
+      if (!data.some(each => each)) window.blank = true;
+    }
+    requestAnimationFrame(look);
+  };
+  look();
+}"""
+
+
+def test_no_picture_is_shown_before_there_is_one(browser, served):
+    page = browser.new_page(viewport=DESK)
+    page.add_init_script(f"({WATCH})()")
+    page.goto(served.url)
+    until(page, "Number(document.body.dataset.alone) > 0")
+    assert page.evaluate("() => [window.looks > 0, Boolean(window.blank)]") == [True, False]
+    assert not page.locator(".setup").is_visible()
+    page.evaluate("() => hear({ type: 'busy', text: 'Setting up another …' })")
+    assert page.get_by_text("Setting up another …").is_visible()
+    assert not page.locator(".board").is_visible()
+    page.close()
+
+
 def test_keys_move_the_pusher_in_both_pictures(page):
     for key, there in (("ArrowLeft", lambda at: at < 0.2), ("ArrowRight", lambda at: at > 0.8)):
         page.keyboard.down(key)
