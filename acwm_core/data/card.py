@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import math
@@ -89,6 +90,12 @@ class DatasetCard:
             f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
             f"--seed {self.seed}{exploration} --out {shlex.quote(str(out))}"
         )
+
+    @property
+    def identity(self) -> str:
+        """A hash of all that determines its episodes, however many there are, in 64 hex digits."""
+        values = {k: v for k, v in _recipe(self).items() if not k.startswith("splits.")}
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def spec(self, split: Split, index: int) -> EpisodeSpec:
         """The spec of an episode."""

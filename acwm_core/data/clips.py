@@ -44,6 +44,8 @@ class DataConfig:
             tenth by default, at most 32.
         symmetries: train on each clip also as the symmetries on the card of the data transform it:
             push_cube, which has seven, gives eight times as many clips. Validation does not.
+        growing: train on the episodes that a running `acwm generate` has finished, and look for
+            more after each pass. The first ones are held out, not the last.
         cache_latents: encode every clip once with the frozen codec and train on the cache, if
             latents are smaller than frames; otherwise decode and encode video at every step.
         workers: processes that load batches in the background; 0 loads in the training process.
@@ -62,6 +64,7 @@ class DataConfig:
     fraction: float = 1.0
     validation_episodes: int | None = None
     symmetries: bool = False
+    growing: bool = False
     cache_latents: bool = True
     workers: int = 0
     reader: Literal["random_access", "webdataset"] = "random_access"
@@ -74,6 +77,11 @@ class DataConfig:
             value = getattr(self, name)
             if value is not None and value < minimum:
                 raise RecipeError(f"data.{name}={value} must be at least {minimum}")
+        if self.growing and (self.fraction != 1 or self.reader != "random_access"):
+            raise RecipeError(
+                "data.growing takes all that there is by data.reader=random_access: leave out "
+                "data.fraction and data.reader, or data.growing"
+            )
         if not 0 < self.fraction <= 1:
             raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
 

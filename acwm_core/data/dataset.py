@@ -112,19 +112,22 @@ class EpisodeDataset:
         path: the data folder, or its URL. Shards behind a URL are fetched on first use and kept in
             a cache (see `acwm_core.data.remote`).
         split: which of its splits.
+        growing: take the first episodes that are finished, while others are still being made.
 
     Attributes:
         path: the local data folder; for a URL, its folder in the cache.
         card: the folder's card.
         lengths: number of frames of every episode.
-        checksum: hash of everything the split holds.
+        checksum: hash of everything the split holds; of what is growing, of the card that it is
+            made by.
         shards: for each shard, the index of its first episode and its number of episodes.
 
     Raises:
         DataError: no such folder or split, or its generation was not finished.
+        DataError: nothing is finished of what is growing, or it was not simulated here.
     """
 
-    def __init__(self, path: str | Path, split: Split) -> None:
+    def __init__(self, path: str | Path, split: Split, *, growing: bool = False) -> None:
         self.path, self.split = data_folder(path), split
         self.card = DatasetCard.read(self.path)
         if split not in self.card.splits:
@@ -134,14 +137,15 @@ class EpisodeDataset:
             raise DataError(f"{path} has no split {split!r}, only {known}{add}")
         wanted = self.card.splits[split]
         manifest = Manifest(self.path / split, wanted)
-        records = manifest.ordered()
+        records = _finished(path, self.card, manifest) if growing else manifest.ordered()
         self.lengths = [length for record in records for length in record.lengths]
-        if len(self.lengths) != wanted:
+        if len(self.lengths) != wanted and not growing:
             raise DataError(
                 f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "
-                "command that made it again to add the others"
+                "command that made it again to add the others, or train beside it with "
+                "data.growing=true"
             )
-        self.checksum = manifest.checksum()
+        self.checksum = self.card.identity if growing else manifest.checksum()
         self.shards = [(record.first, record.episodes) for record in records]
         self._records, self._origin = records, origin(self.path)
 
@@ -230,6 +234,22 @@ class EpisodeDataset:
             record = self._records[number]
             fetch_shard(f"{self._origin}/{self.split}/{record.shard}", path, record.sha256)
         return path
+
+
+def _finished(path: str | Path, card: DatasetCard, manifest: Manifest) -> list[ShardRecord]:
+    """The shards up to the first that is not finished; workers do not finish them in order."""
+    if card.source or origin(data_folder(path)):
+        raise DataError(
+            f"{path} cannot grow: data.growing is for a folder that `acwm generate` fills"
+        )
+    records, episodes = list[ShardRecord](), 0
+    for record in manifest.ordered():
+        if record.first == episodes:
+            records.append(record)
+            episodes += record.episodes
+    if not records:
+        raise DataError(f"no shard of {path} is finished yet: start again once there are some")
+    return records
 
 
 def declared_symmetries(episodes: EpisodeDataset) -> tuple[Symmetry, ...]:

@@ -43,6 +43,7 @@ class ClipSampler:
         world_size: number of processes that train together.
         lengths: length of each clip; the longest form stream 0. All equal by default.
         accumulated: batches per rank and optimiser step, all of one length.
+        origin: the position at which the stream begins; whole optimiser steps.
 
     Attributes:
         position: number of clips that all ranks together have taken; an iteration starts there.
@@ -61,12 +62,13 @@ class ClipSampler:
         world_size: int = 1,
         lengths: Sequence[int] | NDArray[np.int64] | None = None,
         accumulated: int = 1,
+        origin: int = 0,
     ) -> None:
         if length < 1:
             raise ValueError("there are no clips to sample from")
         self.batch_size, self.seed = batch_size, seed
         self.rank, self.world_size = rank, world_size
-        self.position = 0
+        self.position = self._origin = origin
         self._step = accumulated * self.clips_per_step
         of_clips = np.zeros(length) if lengths is None else np.asarray(lengths)
         self._streams = [np.flatnonzero(of_clips == one) for one in np.unique(of_clips)[::-1]]
@@ -90,7 +92,7 @@ class ClipSampler:
             start -= start % self.clips_per_step
         first = start + self.rank * self.batch_size
         for place in itertools.count(first, self.clips_per_step):
-            step, offset = divmod(place, self._step)
+            step, offset = divmod(place - self._origin, self._step)
             cycle, turn = divmod(step, len(self._turns))
             stream = int(self._turns[turn])
             visit = cycle * len(self._streams[stream]) + int(self._visits[turn])

@@ -49,8 +49,7 @@ class ClipData(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
-        training, validation = hold_out(len(self.episodes), config.validation_episodes)
-        self._split = take_fraction(training, config.fraction), validation
+        self._split = self._divided()
         self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
         self._streams = config.reader == "webdataset"
@@ -60,6 +59,11 @@ class ClipData(L.LightningDataModule):
         successive = self.frames - config.context_frames
         self._stride = successive if config.clip_starts == "episode" else config.window_stride
         self._cached = config.cache_latents and compresses(codec) and not self._streams
+
+    def _divided(self) -> tuple[Sequence[int], range]:
+        """The episodes to train on, and those that are held out."""
+        training, validation = hold_out(len(self.episodes), self.config.validation_episodes)
+        return take_fraction(training, self.config.fraction), validation
 
     def sample(self, clips: int) -> tuple[Tensor, Tensor]:
         """First clips of held-out episodes: video `[B, T, 3, H, W]` uint8 and actions.
@@ -78,15 +82,17 @@ class ClipData(L.LightningDataModule):
         """Encode clips that are not encoded yet, each rank a part on its device; open the clips."""
         if self._cached:
             self._encode()
-        training, validation = self._split
-        self._train = self._clips(
-            training,
+        self._train = self._training_clips()
+        self._validation = self._clips(self._split[1], self._stride, cached=self._cached)
+
+    def _training_clips(self) -> ClipDataset | LatentClipDataset:
+        return self._clips(
+            self._split[0],
             self._stride,
             cached=self._cached,
             per_length=self.clips_per_step if self.trainer else self.config.batch_size,
             symmetries=self._symmetries,
         )
-        self._validation = self._clips(validation, self._stride, cached=self._cached)
 
     def _encode(self) -> None:
         trainer = self._trainer()
@@ -103,26 +109,34 @@ class ClipData(L.LightningDataModule):
 
     def train_dataloader(self) -> ClipLoader:
         """The stream of clips, starting after those of the steps done so far."""
-        trainer, config, seed = self._trainer(), self.config, self.seed
+        trainer, seed = self._trainer(), self.seed
         if self._streams:
             if trainer.is_global_zero:
                 warnings.warn(NOT_RESUMABLE, AcwmWarning, stacklevel=2)
             seed += trainer.global_step  # so that a resumed run sees another order
+        return self._loader(self._train, seed, trainer.global_step * self.clips_per_step)
+
+    def _loader(
+        self, clips: ClipDataset | LatentClipDataset, seed: int, position: int, origin: int = 0
+    ) -> ClipLoader:
+        """The clips from a position in their stream on, which begins at `origin`."""
+        trainer, config = self._trainer(), self.config
         sampler = ClipSampler(
-            len(self._train),
+            len(clips),
             batch_size=config.batch_size,
             seed=seed,
             rank=trainer.global_rank,
             world_size=trainer.world_size,
-            lengths=self._train.lengths,
+            lengths=clips.lengths,
             accumulated=trainer.accumulate_grad_batches,
+            origin=origin,
         )
-        sampler.position = trainer.global_step * self.clips_per_step
-        clips = self._train
+        sampler.position = position
+        streamed = clips
         if self._streams and isinstance(clips, ClipDataset):
-            clips = ClipStream(clips, sampler, shuffle_buffer=config.shuffle_buffer)
+            streamed = ClipStream(clips, sampler, shuffle_buffer=config.shuffle_buffer)
         on_gpu = trainer.strategy.root_device.type == "cuda"
-        return ClipLoader(clips, sampler, workers=config.workers, pin_memory=on_gpu)
+        return ClipLoader(streamed, sampler, workers=config.workers, pin_memory=on_gpu)
 
     def val_dataloader(self) -> ClipLoader | list[Any]:
         """The held-out clips in order; every rank uses all, so that all agree on the loss."""
@@ -132,11 +146,11 @@ class ClipData(L.LightningDataModule):
             self._validation, InOrder(self._validation.lengths, self.config.batch_size)
         )
 
-    def state_dict(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, Any]:
         """Clips per optimiser step; with the number of steps this gives the place in the stream."""
         return {"clips_per_step": self.clips_per_step}
 
-    def load_state_dict(self, state_dict: Mapping[str, int]) -> None:
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Check that training can resume with the next clip, also on other devices.
 
         Raises:

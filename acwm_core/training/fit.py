@@ -26,6 +26,7 @@ from acwm_core.training import callbacks
 from acwm_core.training.checkpoints import read_step
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.data import ClipData
+from acwm_core.training.growing import GrowingClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.progress import StepProgress
@@ -70,7 +71,8 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     silence_irrelevant_warnings()
     run = RunFolder(run_dir if resume in (None, AUTO) else resume)
     with _quiet_after_the_first(), claimed(run):
-        episodes = EpisodeDataset(recipe.data["path"], "train")
+        growing = recipe.data.get("growing", False)
+        episodes = EpisodeDataset(recipe.data["path"], "train", growing=growing)
         _check_environment(recipe, episodes.card)
         checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
         first_step = read_step(checkpoint) if checkpoint else 0
@@ -102,7 +104,9 @@ def _train(
     start = None
     if config.init_from and checkpoint is None:
         start = _start_from(config.init_from, world_model, recipe)
-    data = ClipData(DataConfig(**recipe.data), episodes, world_model.codec, config.seed)
+    clips = DataConfig(**recipe.data)
+    kind = GrowingClipData if clips.growing else ClipData
+    data = kind(clips, episodes, world_model.codec, config.seed)
     module, preemption = TrainingModule(world_model, config), Preemption(run)
     trainer = build_trainer(
         recipe.trainer,
