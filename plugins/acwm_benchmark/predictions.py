@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -125,14 +126,15 @@ def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:
 
 
 def _of_draws(found: Mapping[str, Mapping[int, Path]], tasks: Mapping[str, Task]) -> list[str]:
-    most = max((len(each) for each in found.values()), default=0)
+    counts = Counter(len(each) for name, each in found.items() if not tasks[name].branch)
+    usual = counts.most_common(1)[0][0] if counts else 1
     wrong = {
         name: sorted(each)
         for name, each in found.items()
-        if sorted(each) != list(range(most)) and not (tasks[name].branch and [*each] == [0])
+        if sorted(each) != list(range(usual)) and not (tasks[name].branch and [*each] == [0])
     }
     return [
-        f"{name}: draws {', '.join(map(str, draws))} are there, not 0 to {most - 1} as of others"
+        f"{name}: it has the draws {', '.join(map(str, draws))}, but others {usual} from 0 on"
         for name, draws in wrong.items()
     ]
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +133,7 @@ class Tasks:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 return arrays["actions"]
-        except (OSError, ValueError, LookupError) as error:
+        except (OSError, ValueError, LookupError, BadZipFile) as error:
             raise DataError(f"{path} cannot be read ({error}): export the tasks again") from error
 
 

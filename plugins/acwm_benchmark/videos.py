@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import av
 import numpy as np
@@ -18,6 +20,9 @@ from acwm_formats.names import natural
 
 GIF, NPZ, PNG, VIDEO = ".gif", ".npz", ".png", "video"
 CONTAINERS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", GIF)
+
+UNREADABLE = (OSError, ValueError, EOFError, LookupError, BadZipFile, zlib.error)
+"""What NumPy raises for a file that is no sound NPZ."""
 
 GIF_TICK = 0.01
 """Seconds to which GIF rounds times."""
@@ -150,7 +155,7 @@ def _read_arrays(path: Path) -> NDArray[np.float32]:
             if names != [VIDEO]:
                 raise DataError(f"{path.name} holds {', '.join(names) or 'nothing'}, not {VIDEO!r}")
             video: NDArray[Any] = arrays[VIDEO]
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE as error:
         raise DataError(f"{path.name} cannot be read ({error})") from error
     if video.ndim != 4 or video.shape[3] != 3:
         raise DataError(f"{path.name} holds an array {list(video.shape)}, not [T, H, W, 3]")

@@ -39,10 +39,10 @@ def to_npz(path, video):
     np.savez(path.with_name(path.name + ".npz"), video=video)
 
 
-def to_video(container, codec, pixels, **options):
+def to_video(container, codec, pixels, rate=10, **options):
     def write(path, video):
         with av.open(str(path.with_name(path.name + container)), "w") as file:
-            stream = file.add_stream(codec, rate=10, options=options)
+            stream = file.add_stream(codec, rate=rate, options=options)
             stream.height, stream.width = video.shape[1:3]
             stream.pix_fmt = pixels
             for image in (video * 255).round().astype(np.uint8):
