@@ -31,11 +31,18 @@ from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, RUN
 @click.option(
     "--seed", default=0, type=click.IntRange(0, 2**63 - 1), help="Seed of the sampling noise."
 )
+@click.option(
+    "--samples",
+    default=1,
+    type=click.IntRange(1),
+    help="Number of draws to show side by side, of a model that draws.",
+)
 def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.
 
     Starts from the first frame of an episode and uses its actions. The video shows truth |
-    prediction | difference, or only the prediction with --actions or --image.
+    prediction | difference, or only the prediction with --actions or --image. With --samples, draws
+    stand side by side after the truth.
     """
     from acwm_dream.rollout import rollout_run
 

@@ -57,6 +57,7 @@ def rollout_run(
     mode: Mode | None = None,
     steps: int | None = None,
     seed: int = 0,
+    samples: int = 1,
     device: str = "auto",
 ) -> Path:
     """Predict one video with a trained run and write it as MP4, or as a sheet of frames in PNG.
@@ -64,7 +65,7 @@ def rollout_run(
     By default, the context frames (as many as the model was trained with) and the actions come from
     a recorded episode. The video then shows truth | prediction | difference, one below the other if
     a frame shows several views. With other actions or another picture, it shows the prediction
-    only.
+    only. Several draws stand side by side, after the truth if it is known.
 
     Args:
         run: the run folder.
@@ -78,7 +79,8 @@ def rollout_run(
         mode: how a long video is predicted; the model's own mode by default. Windows and streams
             take any number of actions in constant memory.
         steps: sampling steps; the flow's own number by default.
-        seed: seed of the sampling noise.
+        seed: seed of the sampling noise; of several draws, the first one's, and they count up.
+        samples: number of draws to show, of a model that draws.
         device: device of the model; ``"auto"`` takes a GPU if there is one.
 
     Returns:
@@ -111,11 +113,20 @@ def rollout_run(
     assert rows is not None
     model = bundle.world_model.to(choose_device(device))
     where = model.action_low.device
+    if samples > 1 and not model.samples:
+        raise RecipeError(
+            f"this model draws nothing: all {samples} predictions would be the same one, so leave "
+            "--samples out"
+        )
     inputs = torch.tensor(rows)[None].to(where)
     check_pixels(given)
     model.checked(inputs[:, :-1])
     chunks = model.rollout_chunks(
-        given[None].to(where), inputs, mode=mode, steps=steps, seeds=[seed]
+        given[None].expand(samples, *[-1] * given.ndim).to(where),
+        inputs.expand(samples, -1, -1),
+        mode=mode,
+        steps=steps,
+        seeds=range(seed, seed + samples),
     )
     _write(out, _frames(chunks, truth), len(rows), bundle.card)
     return out
@@ -154,19 +165,26 @@ def _with_chosen(
 
 
 def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
-    """The panels of each frame: the prediction, between truth and difference if truth is known."""
+    """The panels of each frame: the prediction, between truth and difference if truth is known.
+
+    Several draws `[N, T, 3, H, W]` follow the truth, without differences.
+    """
     start = 0
     for chunk in chunks:
-        clip = chunk[0].cpu()
-        if not clip.isfinite().all():
+        draws = chunk.cpu()
+        if not draws.isfinite().all():
             raise TrainingError(
                 f"the prediction is not finite from frame {start} on: train the model again with "
                 "a lower training.learning_rate"
             )
-        true = None if truth is None else truth[start : start + len(clip)]
-        parts = [videos.to_pixels(clip)] if true is None else videos.panels(true, clip)
+        true = None if truth is None else truth[start : start + draws.shape[1]]
+        parts = [videos.to_pixels(clip) for clip in draws]
+        if true is not None and len(draws) == 1:
+            parts = videos.panels(true, draws[0])
+        elif true is not None:
+            parts = [videos.to_pixels(true), *parts]
         yield from zip(*parts, strict=True)
-        start += len(clip)
+        start += draws.shape[1]
 
 
 def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCard) -> None:

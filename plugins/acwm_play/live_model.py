@@ -19,7 +19,7 @@ from acwm_core.model.world_model import WorldModel
 Frames = NDArray[np.uint8]
 
 SAMPLES = 3
-"""Samples drawn from a model that uses noise: the one shown, and others to compare it with."""
+"""Futures drawn from a model that draws: the one shown, and others to compare it with."""
 
 SHARE = 0.5
 """Share of real time that prediction with all samples may take."""
@@ -36,9 +36,12 @@ class LiveModel:
     Attributes:
         stride: video frames per latent frame, which is the number of actions per step.
         given: number of frames that it starts from.
+        samples: whether the model draws.
+        draw: number of the draw that is shown from the next restart on.
         spread: root mean square, over the last predicted frame, of the standard deviation of
-            `SAMPLES` samples, as a share of full scale; None if the model uses no noise or
-            sampling is too slow.
+            `SAMPLES` draws, as a share of full scale; None if the model draws none or drawing is
+            too slow.
+        doubt: the same by pixel, the largest over channels, `[1, H, W, 3]` uint8 in grey; or None.
 
     Raises:
         ShapeError: the model was trained on other actions.
@@ -57,9 +60,11 @@ class LiveModel:
         self._steps = steps
         self.stride = world_model.codec.temporal_stride
         self.given = world_model.context_frames
+        self.samples, self.draw = world_model.samples, 0
         self._patience = SHARE * self.stride / card.fps
         self._others: Stream | None = None
         self.spread: float | None = None
+        self.doubt: Frames | None = None
         blank = np.zeros((self.given, *card.frame_size, 3), np.uint8)
         still = [np.array(low, np.float32)] * (self.given - 1)
         try:
@@ -76,15 +81,18 @@ class LiveModel:
         video = as_clip(frames)[None]
         between = torch.from_numpy(np.stack(actions)[None]) if len(actions) else None
         with noting("when the model begins", *self._world_model.children()):
-            self._stream = self._world_model.stream(video, between, steps=self._steps)
-            if self._world_model.objective.steps:
+            first, *seeds = range(SAMPLES * self.draw, SAMPLES * (self.draw + 1))
+            self._stream = self._world_model.stream(
+                video, between, steps=self._steps, seeds=[first]
+            )
+            if self.samples:
                 self._others = self._world_model.stream(
                     video.expand(SAMPLES - 1, -1, -1, -1, -1),
                     None if between is None else between.expand(SAMPLES - 1, -1, -1),
                     steps=self._steps,
-                    seeds=range(1, SAMPLES),
+                    seeds=seeds,
                 )
-        self.spread = None
+        self.spread = self.doubt = None
         return to_pixels(self._stream.given[0, -1:])[0]
 
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
@@ -92,14 +100,16 @@ class LiveModel:
         rows, start = torch.from_numpy(np.stack(actions)[None]), time.monotonic()
         with noting("while the model predicts", *self._world_model.children()):
             video = self._stream.step(rows)
-            self.spread = None
+            self.spread = self.doubt = None
             if self._others is not None:
                 others = self._others.step(rows.expand(SAMPLES - 1, -1, -1))
-                self.spread = _spread(torch.cat([video, others])[:, -1])
+                self.spread, self.doubt = _spread(torch.cat([video, others])[:, -1])
         if time.monotonic() - start > self._patience:
             self._others = None  # until the next restart
         return to_pixels(video[0])
 
 
-def _spread(frames: torch.Tensor) -> float:
-    return float(frames.var(0).mean().sqrt())
+def _spread(frames: torch.Tensor) -> tuple[float, Frames]:
+    variance = frames.var(0)
+    grey = variance.amax(0).sqrt().expand(1, 3, -1, -1)
+    return float(variance.mean().sqrt()), to_pixels(grey)

@@ -85,7 +85,7 @@ class LiveWorld:
         time_steps = await self.simulator.start(scene, self.model.given)
         self.recent.clear()
         self.recent.extend(time_steps)
-        self.scene = scene
+        self.scene, self.model.draw = scene, 0
         return time_steps[-1], await self.take_over()
 
     async def take_over(self) -> NDArray[np.uint8]:
@@ -133,6 +133,7 @@ class LiveWorld:
         return {
             **shared,
             "recorded": self.recorded,
+            "samples": self.model.samples,
             "engine": "" if self.recorded else card.engine,
             "drivers": _describe_drivers() if self.tasks else [],
             "tasks": [_describe_task(name, task) for name, task in self.tasks.items()],

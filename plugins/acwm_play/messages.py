@@ -59,6 +59,11 @@ class TakeOver:
 
 
 @dataclass(frozen=True)
+class Redraw:
+    """Restart the model from the simulator's frame with another draw."""
+
+
+@dataclass(frozen=True)
 class Pause:
     """Pause or continue."""
 
@@ -95,11 +100,11 @@ class Record:
 ServerMessage = Literal["world", "state", "figures", "busy", "notice", "goal", "attempt"]
 """Types of the server's JSON messages."""
 
-PageMessage = Act | Point | Open | TakeOver | Pause | Step | Speed | Drive | Record
+PageMessage = Act | Point | Open | TakeOver | Redraw | Pause | Step | Speed | Drive | Record
 
 PAGE_MESSAGES: Mapping[str, type[Any]] = {
     **{"act": Act, "point": Point, "open": Open, "take_over": TakeOver, "pause": Pause},
-    **{"step": Step, "speed": Speed, "drive": Drive, "record": Record},
+    **{"step": Step, "speed": Speed, "drive": Drive, "record": Record, "redraw": Redraw},
 }
 
 

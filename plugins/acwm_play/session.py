@@ -48,7 +48,7 @@ class Session:
         self._source = ActionSource(self._tell)
         self._live: LiveWorld | None = None
         self._request: messages.Open | None = None
-        self._take_over = False
+        self._take_over = self._redraw = False
         self._last: tuple[TimeStep, NDArray[np.uint8]] | None = None
         self._alone = 0
         self._recording: Recording | None = None
@@ -78,6 +78,8 @@ class Session:
                 self._request = message
             case messages.TakeOver():
                 self._take_over = True
+            case messages.Redraw():
+                self._take_over = self._redraw = True
             case messages.Pause(on):
                 self._clock.paused = on
             case messages.Step():
@@ -137,7 +139,7 @@ class Session:
         await self._wake.wait()
 
     async def _open(self, request: messages.Open) -> None:
-        self._request, self._take_over = None, False
+        self._request, self._take_over, self._redraw = None, False, False
         self._source.stop()
         with contextlib.suppress(Exception):  # it was shown
             await self._end_prediction()
@@ -175,8 +177,9 @@ class Session:
 
     async def _restart_model(self) -> None:
         assert self._live is not None
-        self._take_over = False
         await self._end_prediction()
+        self._live.model.draw += self._redraw
+        self._take_over = self._redraw = False
         self._show_start(self._live.recent[-1], await self._live.take_over())
 
     def _show_start(self, time_step: TimeStep, frame: NDArray[np.uint8]) -> None:
@@ -261,7 +264,10 @@ class Session:
             "progress": dataclasses.asdict(progress) if progress else None,
             "places": None if self._source.driver == PERSON else live.places(time_steps[-1].action),
         }
-        self.outbox.put_frames(pack(header, np.stack([m.frame for m in time_steps]), frames))
+        doubt = live.model.doubt
+        header["doubt"] = doubt is not None
+        simulated = np.stack([m.frame for m in time_steps])
+        self.outbox.put_frames(pack(header, simulated, frames, *([] if doubt is None else [doubt])))
         self._more.set()
 
     async def _measure(self, live: LiveWorld, truth: TimeStep, frame: NDArray[np.uint8]) -> None:

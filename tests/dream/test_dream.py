@@ -158,6 +158,40 @@ def test_episodes_can_be_dreamt_again(run):
     assert seen.any()
 
 
+class Windy(tiny.Exact):
+    """Draws a wind of up to two pixels per frame, and stays with it."""
+
+    samples = True
+
+    def stream(self, given, *, context, generators):
+        stream = super().stream(given, context=context)
+        wind = torch.stack([4 * torch.rand(2, generator=each) - 2 for each in generators])
+        advance = stream.advance
+
+        def blown(conditioning):
+            stream._corners = stream._corners + wind
+            return advance(conditioning)
+
+        stream.advance = blown
+        return stream
+
+
+def test_an_episode_draws_one_future_from_its_seed(run, monkeypatch):
+    monkeypatch.setattr("tests.tiny.Exact", Windy)
+    env, options, still = dream(run), {"spec": tiny.spec(3)}, np.zeros(2, np.float32)
+
+    def last(seed):
+        env.reset(seed=seed, options=options)
+        return [env.step(still)[0] for _ in range(2)]
+
+    one, again, other = last(1), last(1), last(2)
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one[0], other[0])
+    steps = [env.reset(seed=1, options=options)[0], *one]
+    places = [np.argwhere(each[..., 0] > 100).mean(0) for each in steps]
+    assert places[2] - places[1] == pytest.approx(places[1] - places[0], abs=1)  # the same wind
+
+
 def held_bytes():
     """Of all tensors and arrays that are alive."""
     gc.collect()

@@ -35,6 +35,25 @@ def test_a_recorded_episode_is_shown_beside_its_truth(evaluated, data, tmp_path)
         assert np.abs(shown - true).mean() < 6
 
 
+def test_draws_stand_side_by_side_after_the_truth(evaluated, data, tmp_path):
+    out = rollout_run(evaluated, tmp_path / "draws.png", samples=3, seed=5, device="cpu")
+    sheet = np.asarray(Image.open(out))[::SCALE, ::SCALE]
+    rows = [sheet[first : first + SIDE] for first in range(0, len(sheet), SIDE + DIVIDER)]
+    assert len(rows) == 4
+    np.testing.assert_array_equal(rows[0][:, -SIDE:], EpisodeDataset(data, "ind_test")[0].video[-1])
+    for seed, row in zip((5, 6, 7), rows[1:], strict=True):
+        alone = rollout_run(evaluated, tmp_path / "one.png", seed=seed, device="cpu")
+        shown = np.asarray(Image.open(alone))[::SCALE, ::SCALE][SIDE + DIVIDER :][:SIDE]
+        assert np.abs(row.astype(int) - shown).max() <= 1
+    assert not np.array_equal(rows[1], rows[2])
+
+
+def test_a_model_that_draws_nothing_shows_one(evaluated, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiny.PointwiseModel, "samples", False)
+    with pytest.raises(RecipeError, match="--samples"):
+        rollout_run(evaluated, tmp_path / "draws.mp4", samples=2, device="cpu")
+
+
 def test_own_actions_give_the_prediction_alone(evaluated, tmp_path):
     np.save(tmp_path / "actions.npy", np.zeros((20, 2)))
     out = rollout_run(

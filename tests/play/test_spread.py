@@ -68,6 +68,19 @@ def test_the_spread_is_that_of_single_streams(world, frame, monkeypatch):
         expected = np.sqrt(np.mean(last.std(0, ddof=1) ** 2))
         assert played.spread == pytest.approx(expected, rel=1e-3)
         assert played.spread > 0.01
+        std = last.std(0, ddof=1).max(0)  # the largest over channels
+        assert played.doubt[0, ..., 0] == pytest.approx(255 * std, abs=1)
+        assert (played.doubt == played.doubt[..., :1]).all()
+
+
+def test_another_draw_is_another_future_and_the_first_comes_back(world, frame):
+    played, futures = LiveModel(world, CARD, None), []
+    for played.draw in (0, 1, 0):
+        played.restart(frame, [])
+        futures.append(played.step(ACTIONS))
+    assert played.samples
+    assert not np.array_equal(futures[0], futures[1])
+    assert np.array_equal(futures[0], futures[2])
 
 
 def test_samples_end_where_they_take_too_long(world, frame, monkeypatch):
@@ -89,6 +102,7 @@ def test_a_model_without_noise_has_none(frame):
     card = SimpleNamespace(**{**vars(CARD), "frame_size": (64, 64)})
     world = world_of(follower.Follower(latent_channels=codec.channels), codec)
     played = LiveModel(world, card, None)
+    assert not played.samples
     played.restart(np.zeros((1, 64, 64, 3), np.uint8), [])
     played.step(ACTIONS)
     assert played.spread is None

@@ -131,6 +131,7 @@ function frames(buffer) {
     queue.push({
       sim: new Uint8Array(buffer, 4 + length + i * bytes, bytes),
       model: new Uint8Array(buffer, 4 + length + (head.n + i) * bytes, bytes),
+      doubt: last && head.doubt ? new Uint8Array(buffer, 4 + length + 2 * head.n * bytes, bytes) : null,
       seq: head.seqs[i], height, width, head: last ? head : null, compared: head.pixel_error !== null, fps: world ? world.fps : 10,
     });
   }
@@ -159,6 +160,12 @@ function difference({ sim, model }) {
   return picture;
 }
 
+function heated(grey) {
+  const picture = new Uint8Array(grey.length);
+  for (let j = 0; j < grey.length; j += 3) picture.set(heat.subarray(3 * grey[j], 3 * grey[j] + 3), j);
+  return picture;
+}
+
 function play(now) {
   requestAnimationFrame(play);
   pad();
@@ -172,6 +179,7 @@ function play(now) {
   draw($("sim"), frame.sim, frame);
   draw($("model"), frame.model, frame);
   if (frame.compared) draw($("diff"), difference(frame), frame);
+  if (frame.doubt) draw($("doubt"), heated(frame.doubt), frame);
   document.body.classList.toggle("uncompared", !frame.compared);
   document.body.classList.remove("busy");
   if (sentAt.has(frame.seq)) {
@@ -199,11 +207,14 @@ function headline(head) {
   document.body.dataset.dropped = head.dropped;
 }
 
-// How far samples of the model are apart: null or undefined where it cannot tell.
+const FULL_SPREAD = 0.06; // from here on the border of the model's picture is red
+
+// How far draws of the model are apart: null or undefined where it cannot tell.
 function spread(at, share) {
   const told = typeof share === "number";
   if (!told && !document.querySelector(".tiles [data-name=spread]")) return;
-  tile("spread", "Spread", told ? `${(share * 100).toFixed(1)} %` : "–", "of the model’s samples");
+  document.body.style.setProperty("--doubt", told ? Math.min(share / FULL_SPREAD, 1).toFixed(3) : 0);
+  tile("spread", "Spread", told ? `${(share * 100).toFixed(1)} %` : "–", "of the model’s draws");
   note("spread", at, told ? share * 100 : null);
 }
 
@@ -309,6 +320,7 @@ function enter(about) {
   document.title = `${about.environment} · acwm play`;
   document.querySelector(".sim figcaption b").textContent = about.recorded ? "Recording" : "Simulator";
   document.body.classList.toggle("recorded", about.recorded);
+  document.body.classList.toggle("drawing", Boolean(about.samples));
   document.body.classList.toggle("wide-frames", about.size[1] > 1.5 * about.size[0]);
   $("engine").textContent = about.engine;
   $("summary").textContent = about.summary;
@@ -495,7 +507,7 @@ for (const screen of all(".screen[data-touch]")) {
 
 // Keys --------------------------------------------------------------------------------------------
 
-const HOTKEYS = { KeyN: "new", KeyB: "same", KeyX: "take", Space: "pause", Period: "step", KeyV: "record" };
+const HOTKEYS = { KeyN: "new", KeyB: "same", KeyX: "take", KeyZ: "redraw", Space: "pause", Period: "step", KeyV: "record" };
 const typing = (target) => target.matches("select, input[type=range], input[type=radio]");
 
 addEventListener("keydown", (event) => {
@@ -590,6 +602,7 @@ function driveBy(by, task) {
 $("new").onclick = () => open(null, world.asked);
 $("same").onclick = () => open(world.index, world.asked);
 $("take").onclick = () => say("take_over");
+$("redraw").onclick = () => say("redraw");
 $("pause").onclick = () => say("pause", { on: !state.paused });
 $("step").onclick = () => say("step");
 $("record").onclick = () => say("record", { on: !state.recording });
