@@ -179,7 +179,7 @@ function play(now) {
   draw($("sim"), frame.sim, frame);
   draw($("model"), frame.model, frame);
   if (frame.compared) draw($("diff"), difference(frame), frame);
-  if (frame.doubt) draw($("doubt"), heated(frame.doubt), frame);
+  if (frame.head) draw($("doubt"), heated(frame.doubt || new Uint8Array(frame.sim.length)), frame);
   document.body.classList.toggle("uncompared", !frame.compared);
   document.body.classList.remove("busy");
   if (sentAt.has(frame.seq)) {
