@@ -93,3 +93,5 @@ def score(predictions: Path, worlds: tuple[str, ...], tasks: Path, **others: Any
     for world, summary in found.items():
         click.echo(f"{world}:")
         print_summary(summary)
+    where = others["out"] or f"scores/{predictions.resolve().name}"
+    click.echo(f"next: acwm report {where}/{next(iter(found))}")
