@@ -162,7 +162,17 @@ def _remarks(name: str, summary: Summary, metrics: Iterable[str]) -> list[str]:
     where = [name] if summary.handed_in and name != summary.parts["model"] else []
     drawn = {split: draws_phrase(summary, split) for split in summary.splits}
     found = [f"{split_title(split)}: {phrase}" for split, phrase in drawn.items() if phrase]
-    return [*where, *failures(summary), *scored_shares(summary, metrics), *found]
+    return [*where, *failures(summary), *_scored(summary, [*metrics]), *found]
+
+
+def _scored(summary: Summary, metrics: Sequence[str]) -> list[str]:
+    """A phrase with the share that is scored of the model; of several metrics their range."""
+    rows = [each.scores.shares.get("model", {}) for each in summary.splits.values()]
+    found = [row[name] for row in rows for name in metrics if name in row]
+    if len(metrics) < 2 or not found:
+        return scored_shares(summary, metrics)
+    low, high = (f"{100 * share:.0f}" for share in (min(found), max(found)))
+    return [f"{low} to {high} % scored" if low != high else f"{low} % scored"]
 
 
 def _protocol(summary: Summary) -> str:
