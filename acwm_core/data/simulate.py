@@ -80,13 +80,8 @@ def simulate(
             f"{environment.card.name} replays {horizon} or {horizon - 1} actions, "
             f"not {len(actions)}"
         )
-    options = {
-        "spec": spec,
-        "perturbation": perturbation,
-        "perturbed_start": start,
-        "symmetry": symmetry,
-    }
-    card = environment.card
+    options = {"spec": spec, "perturbation": perturbation, "symmetry": symmetry}
+    options, card = {**options, "perturbed_start": start}, environment.card
     taken = np.zeros((horizon, card.action.size), np.float32)
     video: list[NDArray[Any]] = []
     infos: list[dict[str, Any]] = []

@@ -20,6 +20,10 @@ FOLDER = "evaluation"
 SUMMARY = "summary.json"
 VIDEOS = "videos"
 
+DIVIDER = 2
+"""Width of the dark line between the panels of a video, in pixels before magnification; even, as
+H.264 needs."""
+
 VideoFile = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+=-]*\.mp4$", max_length=200)]
 """The name of a video in the folder of a run's videos, never a path."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.evaluation.metric import Prediction
-from acwm_core.evaluation.results import Score, VideoRecord
+from acwm_core.evaluation.results import DIVIDER, Score, VideoRecord
 from acwm_core.evaluation.statistics import finite
 from acwm_core.model.shapes import Clip
 
@@ -18,9 +18,6 @@ ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 
 PANEL = 256
 """Approximate height of a panel in pixels; frames are magnified by a whole factor."""
-
-DIVIDER = 2
-"""Width of the dark line between panels, in pixels before magnification; even, as H.264 needs."""
 
 FULL_ERROR = 0.5
 """Error (maximum over channels, values in [0, 1]) at which the difference panel saturates."""

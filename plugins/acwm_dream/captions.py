@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.evaluation.videos import DIVIDER, magnification
+from acwm_core.evaluation.results import DIVIDER
+from acwm_core.evaluation.videos import magnification
 
 HEIGHT, SIZE, MARGIN = 24, 15, 4
 """Height of a line of captions, of its letters, and what is left free beside them, in pixels."""

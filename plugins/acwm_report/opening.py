@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from acwm_core.evaluation.results import Estimate
-from acwm_core.evaluation.videos import DIVIDER
+from acwm_core.evaluation.results import DIVIDER, Estimate
 from acwm_report.run import EvaluatedRun
 from acwm_report.table import Scale
 from acwm_report.titles import OVER, split_title

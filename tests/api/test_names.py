@@ -11,8 +11,8 @@ import acwm
 
 SIGNATURES = {
     "ClipDataset": "(episodes, *, frames=37, stride=4, indices=None, temporal_stride=None, "
-    "given=1, per_length=1)",
-    "EpisodeDataset": "(path, split)",
+    "given=1, per_length=1, symmetries=())",
+    "EpisodeDataset": "(path, split, *, growing=False)",
     "Recipe": "(env, codec, model, conditioner, objective, training, data, evaluation, trainer)",
     "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
     "clip_frames=37, context_frames=1)",

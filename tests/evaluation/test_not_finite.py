@@ -36,8 +36,8 @@ def failing(data, tmp_path_factory):
     folder = tiny.make_run(tmp_path_factory.mktemp("runs") / "failing", data, **tiny.SWEEP)
     healthy = Evaluator.predict
 
-    def predict(self, truths, kinds, donated=()):
-        made = healthy(self, truths, kinds, donated)
+    def predict(self, truths, kinds, donated=(), draws=0):
+        made = healthy(self, truths, kinds, donated, draws)
         if len(kinds) > 1:
             first = next(each for each in made if each.kind == "model")
             with torch.inference_mode():

@@ -166,6 +166,9 @@ def test_ssim_refuses_frames_below_its_window():
         SSIM().value(clip)
 
 
+SQUARES = "mse", "m_mse", "energy_score"  # small numbers, which tables show in thousandths
+
+
 def test_metrics_say_how_tables_show_them():
     infos = {
         component.name: component.create().info
@@ -189,8 +192,8 @@ def test_metrics_say_how_tables_show_them():
         "Contact timing frames",
     ]
     pixels = {name for name, info in infos.items() if info.reads == "pixels"}
-    assert pixels == {*titles, "lpips", "fvd", "response"}
-    assert {name for name, info in infos.items() if info.factor == 1000} == {"mse", "m_mse"}
+    assert pixels == {*titles, "lpips", "fvd", "response", "energy_score", "spread_skill"}
+    assert {name for name, info in infos.items() if info.factor == 1000} == {*SQUARES}
     assert min(infos, key=lambda name: infos[name].rank) == "psnr"
-    groups = {"Pixels", "Perception", "States", "Physics", "Contacts", "Actions"}
+    groups = {"Pixels", "Perception", "States", "Physics", "Contacts", "Actions", "Draws"}
     assert {info.group for info in infos.values()} == groups
