@@ -27,6 +27,8 @@ from acwm_core.files import made_whole, writing
 from acwm_core.plugins import catalog
 from acwm_formats.timeline import RecordedDataset
 
+ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"}
+
 
 class Export(NamedTuple):
     """What `Format.write` is given.
@@ -117,6 +119,8 @@ def detected_format(path: Path) -> str:
     if len(found) == 1:
         return found[0]
     known = ", ".join(found or (each.name for each in catalog().registry("format")))
+    if path.suffix in ARCHIVES:
+        raise DataError(f"{path} is an archive: unpack it, and import the folder that comes out")
     what = "is in several formats" if found else "is in no format that is known"
     raise DataError(f"{path} {what}: give --format, one of {known}")
 

@@ -6,6 +6,8 @@ import re
 from fractions import Fraction
 from pathlib import Path
 
+from acwm_core.plugins import catalog
+
 
 def natural(name: str) -> list[tuple[int, str]]:
     """A key to sort names by, so that 2 comes before 10."""
@@ -14,9 +16,10 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def word(path: Path) -> str:
-    """The name of a file or folder as one word."""
+    """The name of a file or folder as one word, which is not that of a simulator."""
     name = path.resolve().name.partition(".")[0]
-    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
+    plain = re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
+    return f"{plain}_recorded" if plain in catalog().registry("environment") else plain
 
 
 def words(text: str | None) -> tuple[str, ...]:

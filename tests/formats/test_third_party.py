@@ -152,6 +152,13 @@ def test_it_imports_and_exports(third_party, root, tmp_path):
     assert file.read_bytes() == np.load(root / "2.npz")["video"][:, :, ::-1].tobytes()
 
 
+def test_an_archive_is_to_be_unpacked(tmp_path):
+    (tmp_path / "takes.zip").write_bytes(b"PK")
+    done = said("data", "import", tmp_path / "takes.zip", "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "unpack" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "problem"),
     [

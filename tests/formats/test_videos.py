@@ -53,6 +53,12 @@ def test_a_folder_per_episode_with_several_cameras(tmp_path):
     assert Videos.detect(tmp_path)
 
 
+def test_a_folder_with_the_name_of_a_simulator_is_no_data_of_it(tmp_path):
+    shown = film(tmp_path / "push_cube" / "a.mp4", 1)
+    tables.write_csv(tmp_path / "push_cube" / "a.csv", shown, "time")
+    assert Videos().read(tmp_path / "push_cube").name == "push_cube_recorded"
+
+
 def test_two_cameras_behind_a_url_become_one_wide_frame(tmp_path, monkeypatch):
     monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
     for place in (0, 1):
