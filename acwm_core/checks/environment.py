@@ -290,12 +290,20 @@ class EnvironmentChecks(TaskChecks):
             self.environment.step(np.array(self.card.action.low, np.float32))
             back()
             for index in range(middle, end):
-                frame, *_, info = self.environment.step(usual.actions[index])
-                states = (usual.states[name][index + 1] for name in info["state"])
-                pairs = zip(info["state"].values(), states, strict=True)
-                same = all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
-                same = same and np.array_equal(frame, usual.video[index + 1])
-                expect(same, "after returning to a snapshot, the same actions lead elsewhere")
+                other = self._other_than(usual, index)
+                after = f"{index + 1 - middle} frames after returning to a snapshot"
+                expect(not other, f"{after}, the same actions give other {', '.join(other)}")
+
+    def _other_than(self, usual: Episode, index: int) -> list[str]:
+        """Take the usual action, and name what of the next frame is not as it was then."""
+        frame, *_, info = self.environment.step(usual.actions[index])
+        found = {**info["state"], "video": frame}
+        wanted = {**usual.states, "video": usual.video}
+        return [
+            name
+            for name, value in found.items()
+            if not np.array_equal(value, wanted[name][index + 1], equal_nan=True)
+        ]
 
     def _started(self, spec: EpisodeSpec) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         return self.environment.reset(options={"spec": spec})

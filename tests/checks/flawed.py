@@ -226,7 +226,7 @@ class PolicyCheats(Disc):
         return act
 
 
-@FLAWS.caught_by("snapshot returns to its moment", "lead elsewhere")
+@FLAWS.caught_by("snapshot returns to its moment", "after returning to a snapshot")
 class ForgetsTheMoment(Disc):
     def _snapshot(self):
         position = self.position

@@ -1,0 +1,1 @@
+"""Push-T of gym-pusht as an environment for acwm."""
