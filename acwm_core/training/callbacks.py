@@ -36,6 +36,9 @@ STRIP = "validation: truth above prediction"
 class NanGuard(Callback):
     """Stops training before a loss or gradient that is not finite reaches the weights.
 
+    Steps do not wait for an accelerator. There, it looks at the gradients of the last steps when
+    metrics are logged, and before anything is validated or saved.
+
     It also stops if a validation result, the weights or their average are not finite, before they
     are saved. The average must be checked itself, since it has no gradient.
 
@@ -44,6 +47,7 @@ class NanGuard(Callback):
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
+        self._norms = dict[int, Tensor]()  # of steps that were not looked at yet
 
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
@@ -53,8 +57,10 @@ class NanGuard(Callback):
         norm = gradient_norm(pl_module.world_model.parameters())
         pl_module.gradient_norm = norm
         pl_module.log("train/gradient_norm", norm)
-        if trainer.scaler is None and not torch.isfinite(norm):
-            self._stop(trainer, "the loss or its gradient is")
+        if trainer.scaler is None:
+            self._norms[trainer.global_step] = norm
+            if norm.device.type == "cpu":
+                self._look(trainer)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -62,6 +68,12 @@ class NanGuard(Callback):
         """Check the loss if there is a gradient scaler (16-mixed): only gradients may overflow."""
         if trainer.scaler is not None and not torch.isfinite(outputs["loss"]):
             self._stop(trainer, "the loss or its gradient is")
+        if self._norms and is_logged(trainer):
+            self._look(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Check the gradients of the steps before."""
+        self._look(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Check the validation results; all ranks have the same."""
@@ -73,14 +85,24 @@ class NanGuard(Callback):
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Check the weights and their average before they are written."""
+        self._look(trainer)
         if not _are_finite(checkpoint["state_dict"].values()):
             self._stop(trainer, "the weights or their average are")
 
-    def _stop(self, trainer: Trainer, what: str) -> None:
+    def _look(self, trainer: Trainer) -> None:
+        """Stop at the first step whose gradient was not finite."""
+        norms, self._norms = self._norms, {}
+        if norms:
+            finite: list[bool] = cast(Any, torch.stack([*norms.values()]).isfinite()).tolist()
+            for step, is_finite in zip(norms, finite, strict=True):
+                if not is_finite:
+                    self._stop(trainer, "the loss or its gradient is", step)
+
+    def _stop(self, trainer: Trainer, what: str, step: int | None = None) -> None:
         last = self._run.last_checkpoint
         kept = f"{last} is the last good checkpoint" if last.exists() else "nothing was saved yet"
         raise TrainingError(
-            f"{what} not finite in step {trainer.global_step} ({kept}); "
+            f"{what} not finite in step {trainer.global_step if step is None else step} ({kept}); "
             "lower training.learning_rate or trainer.gradient_clip_val, or use "
             "trainer.precision=32-true"
         )
@@ -301,6 +323,12 @@ class LastCheckpoint(Checkpoint):
 def stepped(trainer: Trainer, batch_idx: int) -> bool:
     """Whether the batch that just ended was the last one of an optimiser step."""
     return (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+
+
+def is_logged(trainer: Trainer) -> bool:
+    """Whether the metrics of the step that just ended are logged: steps may wait for them."""
+    interval: int = cast(Any, trainer).log_every_n_steps
+    return interval > 0 and trainer.global_step % interval == 0
 
 
 def validates_after_this_batch(trainer: Trainer) -> bool:

@@ -45,10 +45,10 @@ def check_together(training: Mapping[str, Any], trainer: Mapping[str, Any]) -> N
     Raises:
         RecipeError: the optimiser does not work with the strategy.
     """
-    if training.get("optimizer") == "muon" and trainer.get("strategy") == "fsdp":
+    if training.get("optimizer") == "muon" and trainer.get("strategy") in ("fsdp", "hsdp"):
         raise RecipeError(
-            "training.optimizer=muon needs whole matrices, but trainer.strategy=fsdp shards them: "
-            "set training.optimizer=adamw or trainer.strategy=ddp"
+            f"training.optimizer=muon needs whole matrices, which trainer.strategy="
+            f"{trainer['strategy']} shards: set training.optimizer=adamw or trainer.strategy=ddp"
         )
 
 

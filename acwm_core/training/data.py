@@ -135,8 +135,8 @@ class ClipData(L.LightningDataModule):
         streamed = clips
         if self._streams and isinstance(clips, ClipDataset):
             streamed = ClipStream(clips, sampler, shuffle_buffer=config.shuffle_buffer)
-        on_gpu = trainer.strategy.root_device.type == "cuda"
-        return ClipLoader(streamed, sampler, workers=config.workers, pin_memory=on_gpu)
+        pinned = trainer.strategy.root_device.type not in ("cpu", "mps")
+        return ClipLoader(streamed, sampler, workers=config.workers, pin_memory=pinned)
 
     def val_dataloader(self) -> ClipLoader | list[Any]:
         """The held-out clips in order; every rank uses all, so that all agree on the loss."""

@@ -41,6 +41,7 @@ from acwm_core.training.run import all_training, load_weights
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
 from acwm_core.training.threads import use_threads
+from acwm_core.training.throughput import Throughput
 from acwm_core.training.tracking import begin, tracking
 from acwm_core.training.trainer import build_trainer
 
@@ -150,6 +151,7 @@ def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[C
         StepProgress(),
         callbacks.LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         callbacks.BestCheckpoint(run.checkpoints),
+        Throughput(data.frames, data.episodes.card.environment.frame_size),
     ]
     every, shown, rollouts = (
         config.sample_every_n_steps,

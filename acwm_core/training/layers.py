@@ -48,8 +48,21 @@ def recompute_activations(layers: Sequence[nn.Module]) -> None:
         layer.forward = functools.partial(checkpoint, layer.forward, use_reentrant=False)
 
 
+REPLICAS, SHARDS = "data_parallel", "tensor_parallel"
+"""Lightning's names of the two dimensions of a mesh; here clips are spread over both."""
+
+
+def sharding_mesh(mesh: DeviceMesh) -> DeviceMesh:
+    """The mesh of `shard`: one dimension, or two of which the first holds copies of the shards."""
+    return mesh[SHARDS] if mesh[REPLICAS].size() == 1 else mesh
+
+
 def shard(world_model: WorldModel, mesh: DeviceMesh) -> None:
     """Shard the trained weights over the devices, in place; the codec stays whole.
+
+    With two dimensions, the devices along the second share the weights, and the first has copies:
+    what is gathered never leaves a node, and only gradients are exchanged between nodes (hybrid
+    sharding).
 
     A layer's weights are gathered when it runs and freed right after; weights outside of layers are
     gathered once per evaluation. Weights become `DTensor`s, cut along their first dimension. From

@@ -41,6 +41,10 @@ IRRELEVANT = (
 """Patterns of warnings about things that are intended."""
 
 
+SPEED = "speed/"
+"""Prefix of metrics that differ when training is repeated; `metrics.csv` does without them."""
+
+
 def silence_irrelevant_warnings() -> None:
     """Silence tips and warnings that users of acwm cannot act on; errors stay visible."""
     for name in (lightning_pytorch.__name__, "lightning.fabric"):  # their import sets levels, too
@@ -111,7 +115,8 @@ class MetricsFile(Logger):
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Append one row."""
-        row = {"step": step, **{k: repr(float(v)) for k, v in metrics.items() if k != "epoch"}}
+        kept = {k: v for k, v in metrics.items() if k != "epoch" and not k.startswith(SPEED)}
+        row = {"step": step, **{k: repr(float(v)) for k, v in kept.items()}}
         if len(row) == 1:
             return
         if not row.keys() <= {*self._columns}:

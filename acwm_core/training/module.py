@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -19,7 +19,12 @@ from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.layers import recompute_activations, shard, trained_layers
+from acwm_core.training.layers import (
+    recompute_activations,
+    shard,
+    sharding_mesh,
+    trained_layers,
+)
 from acwm_core.training.optimizers import (
     averaged_copy,
     build_optimizer,
@@ -34,6 +39,9 @@ TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 SHORTEST_HORIZON = 4
 """Number of predicted latent frames at the beginning of `training.growing_horizon`, and the minimum
 after a random start."""
+
+COMPILED_LENGTHS = 6
+"""Lengths of shortened clips that a compiled model sees; PyTorch compiles a function 8 times."""
 
 Batch = Mapping[str, Any]
 """``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": [B]}``, where positions are the
@@ -55,6 +63,7 @@ class TrainingModule(L.LightningModule):
         averaged: the exponential moving average of `world_model`.
         is_sharded: whether the weights are sharded over the devices, so that all must compute
             together.
+        trained_on: clips of the current batch, and how many video frames of each it uses.
         gradient_norm: gradient norm of the current step before clipping; set by `NanGuard`.
     """
 
@@ -64,13 +73,14 @@ class TrainingModule(L.LightningModule):
         self.config = config
         self.averaged = averaged_copy(world_model)
         self.is_sharded = False
+        self.trained_on = 0, 0
         self.gradient_norm: Tensor | None = None
         self._losses: list[Tensor] = []
 
     def configure_model(self) -> None:
         """Set up activation checkpointing, compilation and sharding as the recipe says."""
         layers, compiles = trained_layers(self.world_model), self.config.compile
-        mesh = self.device_mesh
+        mesh = self.device_mesh and sharding_mesh(self.device_mesh)
         # Compiling the whole model is fastest, but impossible if layers are sharded or recomputed.
         by_layers = layers and (mesh is not None or self.config.activation_checkpointing)
         if compiles and by_layers:
@@ -82,7 +92,7 @@ class TrainingModule(L.LightningModule):
             recompute_activations(layers)
         if mesh is not None:
             for world_model in (self.world_model, self.averaged):
-                shard(world_model, mesh["data_parallel"])
+                shard(world_model, mesh)
             self.is_sharded = True
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -92,6 +102,7 @@ class TrainingModule(L.LightningModule):
         generators = [generator_of(*key) for key in keys]
         with noting(f"in training step {self.global_step + 1}", *self.world_model.children()):
             latents, actions = self._trained_part(self.latents(batch), batch["actions"])
+            self.trained_on = len(actions), actions.shape[1]
             loss = self.world_model.loss(latents, actions, generators)
         if not loss.requires_grad:
             name = type(self.world_model.model).__name__
@@ -102,9 +113,19 @@ class TrainingModule(L.LightningModule):
             self._losses.clear()
         self._losses.append(loss.detach())
         mean = torch.stack(self._losses).mean()  # of the step so far; the logged value is the last
-        self.log("train/loss", mean, prog_bar=True, sync_dist=True)
-        self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
+        # For a bar of Lightning's it would read the number, and so wait for an accelerator.
+        on_cpu = mean.device.type == "cpu"
+        self.log("train/loss", self._of_all_processes(mean), prog_bar=on_cpu)
+        rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+        self.log("train/learning_rate", torch.tensor(rate))  # Lightning would wait to copy a float
         return loss
+
+    def _of_all_processes(self, value: Tensor) -> Tensor:
+        """The mean over the processes; `sync_dist` of Lightning would wait for all of them."""
+        if distributed.is_initialized():
+            cast(Any, distributed).all_reduce(value)
+            value.div_(distributed.get_world_size())
+        return value
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Loss of the averaged weights, with noise that depends only on the clip."""
@@ -127,9 +148,9 @@ class TrainingModule(L.LightningModule):
 
     def _trained_part(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
         """The part of the clips that this step uses: random start, and the current horizon."""
-        codec, config = self.world_model.codec, self.config
-        given = codec.latent_frames(self.world_model.context_frames)
-        spare = latents.shape[1] - given - SHORTEST_HORIZON
+        codec, config, whole = self.world_model.codec, self.config, latents.shape[1]
+        shortest = codec.latent_frames(self.world_model.context_frames) + SHORTEST_HORIZON
+        spare = whole - shortest
         if spare > 0 and config.random_starts:
             random = generator_of(config.seed, TRAIN_STARTS, self.global_step)
             if torch.rand((), generator=random) < config.random_starts:
@@ -138,9 +159,12 @@ class TrainingModule(L.LightningModule):
                 spare -= start
         growth = config.growing_horizon * self.trainer.max_steps
         if spare > 0 and self.global_step < growth:
-            kept = given + SHORTEST_HORIZON + int(spare * self.global_step / growth)
-            latents, actions = latents[:, :kept], actions[:, : codec.video_frames(kept)]
-        return latents, actions
+            kept = shortest + int(spare * self.global_step / growth)
+            latents = latents[:, :kept]
+        kept = latents.shape[1]
+        if config.compile and shortest < kept < whole:
+            kept -= (kept - shortest) % -(-(whole - shortest) // COMPILED_LENGTHS)
+        return latents[:, :kept], actions[:, : codec.video_frames(kept)]
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning-rate schedule that is updated every step."""

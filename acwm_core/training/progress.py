@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from typing import Any
 
@@ -11,7 +12,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 
 from acwm_core.executors import progress_bar
-from acwm_core.training.callbacks import stepped
+from acwm_core.training.callbacks import is_logged, stepped
 
 
 class StepProgress(ProgressBar):
@@ -24,6 +25,7 @@ class StepProgress(ProgressBar):
         super().__init__()
         self._shown = True
         self._open = contextlib.ExitStack()
+        self._losses = ""
 
     def disable(self) -> None:
         """Show nothing (used on all ranks but the first)."""
@@ -47,15 +49,17 @@ class StepProgress(ProgressBar):
             unit="steps",
             done=trainer.global_step,
             shown=self._shown,
-            note=lambda: self._losses(trainer, pl_module),
+            note=lambda: self._losses,
         )
         self._advance = self._open.enter_context(bar)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Advance after the last batch of a step."""
+        """Advance after the last batch of a step; read the losses when they are logged."""
         if stepped(trainer, batch_idx):
+            if is_logged(trainer) or not self._losses:
+                self._read_losses(trainer, pl_module)
             self._advance(1)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -68,6 +72,7 @@ class StepProgress(ProgressBar):
         """Stop the bar so that the terminal is usable again."""
         self._open.close()
 
-    def _losses(self, trainer: Trainer, pl_module: LightningModule) -> str:
-        metrics = self.get_metrics(trainer, pl_module)
-        return "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float))
+    def _read_losses(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        losses = {"train/loss": float(trainer.callback_metrics.get("train/loss", math.nan))}
+        metrics = {**losses, **self.get_metrics(trainer, pl_module)}
+        self._losses = "  ".join(f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float))

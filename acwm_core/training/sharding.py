@@ -1,6 +1,7 @@
 """What Lightning's Trainer writes checkpoints with: single files, or folders of shards.
 
-With `trainer.strategy=fsdp` each device keeps a shard of weights, average and optimiser states.
+With `trainer.strategy=fsdp` each device keeps a shard of weights, average and optimiser states, and
+with `hsdp` each device of a node.
 """
 
 from __future__ import annotations
@@ -54,12 +55,21 @@ class ShardedStrategy(ModelParallelStrategy):
     Zhao et al. 2023, arXiv 2304.11277. `TrainingModule.configure_model` does the sharding.
     Checkpoints are folders to which each process writes its shard. Any number of processes, sharded
     or not, can read them.
+
+    Args:
+        within_nodes: whether each node keeps a copy, sharded over its devices; otherwise there is
+            one copy, sharded over all devices of all nodes.
     """
 
+    def __init__(self, *, within_nodes: bool = False) -> None:
+        super().__init__()
+        self._within_nodes = within_nodes
+
     def setup_environment(self) -> None:
-        """Shard over all devices of all nodes, without tensor parallelism."""
-        self._data_parallel_size = self.num_nodes * self.num_processes
-        self._tensor_parallel_size = 1
+        """Number the devices by copies of the weights (`REPLICAS`), and by shards (`SHARDS`)."""
+        copies = self.num_nodes if self._within_nodes else 1
+        self._data_parallel_size = copies
+        self._tensor_parallel_size = self.num_nodes * self.num_processes // copies
         super().setup_environment()
 
     def lightning_module_state_dict(self) -> dict[str, Any]:

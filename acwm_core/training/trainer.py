@@ -65,13 +65,13 @@ def build_trainer(
     kept = [callback for callback in callbacks if _wanted(callback, chosen, added)]
     strategy = chosen.get("strategy")
     others = (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy)
-    if strategy == "fsdp":
-        chosen["strategy"] = ShardedStrategy()
+    if strategy in ("fsdp", "hsdp"):
+        chosen["strategy"] = ShardedStrategy(within_nodes=strategy == "hsdp")
     elif isinstance(strategy, others) or str(strategy).startswith(("fsdp", "deepspeed")):
         name = strategy if isinstance(strategy, str) else type(strategy).__name__
         raise TrainingError(
             f"{name} shards the weights in a way that their moving average and checkpoints cannot "
-            "follow: use trainer.strategy=fsdp, or ddp if all fits on one device"
+            "follow: use trainer.strategy=fsdp or hsdp, or ddp if all fits on one device"
         )
     plugins = _listed(chosen.pop("plugins", None))
     if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):

@@ -54,9 +54,8 @@ class GoalCost:
         return costs
 
 
-def still_latent(codec: Codec, picture: Frame) -> Latent:
+def still_latent(codec: Codec, picture: Frame, device: torch.device) -> Latent:
     """Encode a still picture as a latent frame, as it is after a video's first frame."""
-    device = next((p.device for p in codec.parameters()), torch.device("cpu"))
     video = as_clip(np.stack([picture] * (1 + codec.temporal_stride)))[None].to(device)
     with torch.no_grad():
         return codec.encode(video)[:, -1:]
@@ -137,7 +136,7 @@ class ModelFutures(Futures):
         for known, latent in self._stills:
             if known is picture:
                 return latent
-        latent = still_latent(self._codec, picture)
+        latent = still_latent(self._codec, picture, self._latents.device)
         self._stills.append((picture, latent))
         return latent
 

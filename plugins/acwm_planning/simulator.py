@@ -74,7 +74,8 @@ class SimulatorFutures(Futures):
     def still(self, picture: Frame) -> Latent:
         if self._codec is None:
             raise RecipeError("the simulator has no latents: take cost=state")
-        return still_latent(self._codec, picture)
+        device = next((each.device for each in self._codec.parameters()), torch.device("cpu"))
+        return still_latent(self._codec, picture, device)
 
     def _simulate(self, frames: Sequence[int]) -> tuple[list[Frame], Observation]:
         chosen = tuple(frames)

@@ -24,7 +24,7 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.flow import MIN_SIGMA, evaluation, mix, per_frame
-from acwm_core.model.objectives.objective import Batch
+from acwm_core.model.objectives.objective import Batch, sent
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -73,15 +73,17 @@ class ShortcutForcing(DiffusionForcing):
         latents, conditioning = batch.latents, batch.conditioning
         frames = latents.shape[1] - known
         drawn = [self.draw_steps(frames, generator) for generator in batch.generators]
-        place, step = (
-            functional.pad(torch.stack(each), (known, 0)).to(latents)
-            for each in zip(*drawn, strict=True)
+        places, steps = (
+            functional.pad(torch.stack(each), (known, 0)) for each in zip(*drawn, strict=True)
         )
+        place, step = sent(places, latents), sent(steps, latents)
         sigma = self.level(place)
         noisy = mix(latents, batch.noise(latents.shape[1]), sigma)
         target = latents.clone()
-        long = step.any(1)
-        if long.any():
+        # Chosen on the CPU, so that nothing waits for an accelerator.
+        chosen = steps.any(1).nonzero().flatten()
+        if len(chosen):
+            long = sent(chosen, latents, torch.long)
             own = of_clips(conditioning, long)
             found = self.target(model, own, noisy[long], place[long], step[long])
             with_step = per_frame(step[long]) > 0

@@ -1,4 +1,4 @@
-"""Two processes that train together, by DDP and by FSDP, against one; killed, stopped, resumed."""
+"""Processes that train together, by DDP, FSDP and HSDP, against one; killed, stopped, resumed."""
 
 import json
 import os
@@ -40,22 +40,26 @@ def callback(name, **init_args):
     return {"class_path": f"tests.training.callbacks.{name}", "init_args": init_args}
 
 
-def in_two_processes(data, jobs):
-    """Run jobs of `train_many` on two ranks, as torchrun would start them."""
+def in_processes(data, jobs, nodes=1):
+    """Run jobs of `train_many` on two ranks per node, as torchrun would start them."""
     store = torch.distributed.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
-    common = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
+    common = {"MASTER_ADDR": "localhost", "MASTER_PORT": str(store.port)}
+    common |= {"WORLD_SIZE": f"{2 * nodes}"}
     common |= {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_RESTART_COUNT": "0"}
     common |= {"TORCHELASTIC_RUN_ID": "test", "OMP_NUM_THREADS": "1", "LOCAL_WORLD_SIZE": "2"}
     started = [
         subprocess.Popen(
             [sys.executable, "-m", "tests.training.train_many", str(data), json.dumps(jobs)],
             cwd=ROOT,
-            env={**os.environ, **common, "RANK": rank, "LOCAL_RANK": rank, "GROUP_RANK": "0"},
+            env={**os.environ, **common, **ranks},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        for rank in "01"
+        for ranks in (
+            {"RANK": f"{rank}", "LOCAL_RANK": f"{rank % 2}", "GROUP_RANK": f"{rank // 2}"}
+            for rank in range(2 * nodes)
+        )
     ]
     try:
         return [(process, *process.communicate(timeout=600)) for process in started]
@@ -120,10 +124,10 @@ def job(runs, name, *, resume=False, weighed=False):
     return {"run": str(path), "sections": words, "resume": resumed, "spared": resume}
 
 
-def outcomes(data, jobs):
-    (first, printed, errors), (second, _, others) = in_two_processes(data, jobs)
-    assert (first.returncode, second.returncode) == (0, 0), errors + others
-    return json.loads(printed.splitlines()[-1])
+def outcomes(data, jobs, nodes=1):
+    ended = in_processes(data, jobs, nodes)
+    assert not any(process.returncode for process, *_ in ended), "".join(e for *_, e in ended)
+    return json.loads(ended[0][1].splitlines()[-1])
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +154,7 @@ def more_runs(runs, data):
     fit(tiny_recipe(data, **sections(4, training=CONSTANT)), runs["constant"].path)
     begun = sections(4, max_steps=7, training=CONSTANT)
     fit(tiny_recipe(data, **begun), runs["scattered"].path)
-    killed = in_two_processes(data, [job(runs, "killed")])
+    killed = in_processes(data, [job(runs, "killed")])
     assert -signal.SIGKILL in [process.returncode for process, *_ in killed]
     jobs = [job(runs, name, resume=True) for name in ("killed", "scattered")]
     jobs += [job(runs, name) for name in ("recomputed", "gathered")]
@@ -235,3 +239,21 @@ def test_a_run_moves_to_other_devices(more_runs, data):
     fit(tiny_recipe(data, **whole), "", resume=moved.path)
     assert moved.last_checkpoint.is_file()
     assert_close(runs["constant"], moved)
+
+
+@pytest.mark.slow
+def test_nodes_with_copies_of_shards_train_as_one_device(runs, data, tmp_path):
+    """Two nodes of two processes; resumed where they were stopped, and by one process."""
+    flags = {"devices": 2, "num_nodes": 2, "strategy": "hsdp"}
+    stopping = {**flags, "callbacks": [callback("Signal", batch=9, rank=3)]}
+    whole, run = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "run")
+
+    def made(folder, flags, **more):
+        return {"run": str(folder.path), "sections": sections(1, **flags), "resume": None, **more}
+
+    again = made(run, flags, resume=str(run.path))
+    done, stopped, _ = outcomes(data, [made(whole, flags), made(run, stopping), again], nodes=2)
+    assert done is None
+    assert stopped.startswith("75: stopped by SIGTERM, saved step 10")
+    assert_close(runs["one"], whole)
+    assert_same(whole, run)

@@ -19,7 +19,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.flow import Evaluate, FlowMatching, FlowStream, evaluation, mix
-from acwm_core.model.objectives.objective import Batch
+from acwm_core.model.objectives.objective import Batch, sent
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -91,7 +91,7 @@ class NextFrame(FlowMatching):
         past = self._past(model, batch, known)
         levels = torch.stack([torch.rand(frames, generator=each) for each in generators])
         noise = batch.noise(frames)
-        sigma = (levels * self.past_noise).to(latents)
+        sigma = sent(levels * self.past_noise, latents)
         previous = mix(frames_before(past), noise, sigma)
         after = evaluation(model, batch.conditioning, previous=previous, previous_sigma=sigma)
         return self.error(self.from_change(after, previous), latents, generators, known)
@@ -110,7 +110,7 @@ class NextFrame(FlowMatching):
         given = Batch(latents[:, :known], batch.conditioning, noises)
         with torch.no_grad():
             rollout = self.predict(model, given, latents.shape[1], steps=1)
-        return torch.where(own.to(latents.device)[:, None, None, None, None], rollout, latents)
+        return torch.where(sent(own, latents)[:, None, None, None, None] > 0, rollout, latents)
 
     def predict(
         self, model: Denoiser, given: Batch, frames: int, steps: int | None = None

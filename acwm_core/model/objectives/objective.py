@@ -34,12 +34,24 @@ class Batch:
 
     def noise(self, frames: int) -> Latent:
         """Standard normal noise `[B, frames, C, h, w]`, of the latents' type and device."""
-        return drawn_noise((frames, *self.latents.shape[2:]), self.generators).to(self.latents)
+        return sent(drawn_noise((frames, *self.latents.shape[2:]), self.generators), self.latents)
 
 
 def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
     """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""
     return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
+
+
+def sent(tensor: Tensor, to: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """A tensor of the CPU on the device of another, and in its type unless one is given.
+
+    An accelerator copies it from page-locked memory when it comes to it, so the program goes on.
+    (Apple's cannot be trusted with that.)
+    """
+    made = tensor.to(dtype or to.dtype)
+    if to.device.type in ("cpu", "mps", "meta"):
+        return made.to(to.device)
+    return made.pin_memory().to(to.device, non_blocking=True)
 
 
 class Objective(ABC, Generic[ModelT]):
