@@ -42,10 +42,11 @@ class Setting:
     size: int
     context: int
     seconds: float
+    device: str = "cpu"
 
     def first_frame(self) -> Tensor:
         """A random frame to start from."""
-        return torch.rand(1, 3, self.size, self.size)
+        return torch.rand(1, 3, self.size, self.size).to(self.device)
 
 
 def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
@@ -64,11 +65,12 @@ def random_world(setting: Setting, *, decoding: bool) -> WorldModel:
     )
     if not decoding:
         grey = torch.full((1, codec.temporal_stride, 3, setting.size, setting.size), 0.5)
+        grey = grey.to(setting.device)
         codec.frame_decoder = lambda: lambda latents: grey
     objective = DiffusionForcing(prediction="clean", shift=20, steps=setting.steps)
     bounds = [-1.0] * ACTION_SIZE, [1.0] * ACTION_SIZE
     world = WorldModel(codec, shaken(network), shaken(conditioner), objective, *bounds)
-    return world.requires_grad_(False).eval()
+    return world.requires_grad_(False).eval().to(setting.device)
 
 
 class Uncached:
@@ -77,7 +79,7 @@ class Uncached:
     def __init__(self, world: WorldModel, first: Tensor, context: int) -> None:
         self.world, self.context = world, context
         self.latents = world.encode(first[:, None])
-        self.actions = torch.zeros(1, 0, ACTION_SIZE)
+        self.actions = torch.zeros(1, 0, ACTION_SIZE, device=first.device)
         self.generator = torch.Generator().manual_seed(0)
 
     @torch.inference_mode()
@@ -93,7 +95,7 @@ class Uncached:
             levels = functional.pad(sigma, (past.shape[1], 0))
             return world.model(torch.cat([past, noisy], 1), levels, conditioning)[:, -1:]
 
-        noise = torch.randn(past.shape[2:], generator=self.generator)[None, None]
+        noise = torch.randn(past.shape[2:], generator=self.generator)[None, None].to(past)
         new = world.objective.sample(denoise, noise, noise[:, :0])
         self.latents = torch.cat([past, new], 1)
         return new
@@ -111,39 +113,46 @@ class Timing:
         return float(np.median([sum(clip) for clip in self.clips]))
 
 
-def timed(step: Callable[[Tensor], Tensor], count: int, budget: float = np.inf) -> list[float]:
+def timed(
+    step: Callable[[Tensor], Tensor], count: int, device: str, budget: float = np.inf
+) -> list[float]:
     """Seconds of up to `count` steps, at least one, within the budget."""
     times: list[float] = []
-    actions = torch.rand(1, 4, ACTION_SIZE) * 2 - 1
+    actions = (torch.rand(1, 4, ACTION_SIZE) * 2 - 1).to(device)
     while len(times) < count and (not times or sum(times) < budget):
         began = time.perf_counter()
         step(actions)
+        if device == "cuda":
+            torch.cuda.synchronize()
         times.append(time.perf_counter() - began)
     return times
 
 
-def measure(start: Callable[[], Callable[[Tensor], Tensor]], seconds: float) -> Timing:
-    """Time clips from their start for `seconds`, then the frames after the last clip as long."""
+def measure(start: Callable[[], Callable[[Tensor], Tensor]], setting: Setting) -> Timing:
+    """Time clips from their start for some seconds, then the frames after the last clip as long."""
+    seconds, device = setting.seconds, setting.device
     clip_steps = (CLIP_FRAMES - 1) // 4
     step = start()
-    timed(step, 2)  # not measured: creates tables and allocates memory
+    timed(step, 2, device)  # not measured: creates tables and allocates memory
     clips: list[list[float]] = []
     while not clips or sum(map(sum, clips)) < seconds:
         step = start()
-        clips.append(timed(step, clip_steps))
-    return Timing(clips, timed(step, 200, seconds))
+        clips.append(timed(step, clip_steps, device))
+    return Timing(clips, timed(step, 200, device, seconds))
 
 
 def whole_clip(world: WorldModel, setting: Setting) -> float:
     """Seconds to predict a whole clip at once, the fastest mode if all actions are known."""
-    first, actions = setting.first_frame(), torch.rand(1, CLIP_FRAMES, ACTION_SIZE)
-    times = timed(lambda _: world.rollout(first, actions), 1000, setting.seconds)
+    first = setting.first_frame()
+    actions = torch.rand(1, CLIP_FRAMES, ACTION_SIZE).to(setting.device)
+    rollout = lambda _: world.rollout(first, actions)  # noqa: E731
+    times = timed(rollout, 1000, setting.device, setting.seconds)
     return float(np.median(times))
 
 
 def difference(world: WorldModel, setting: Setting) -> float:
     """Largest difference between a clip's frames with and without a cache."""
-    first, actions = setting.first_frame(), torch.rand(9, 1, 4, ACTION_SIZE)
+    first, actions = setting.first_frame(), torch.rand(9, 1, 4, ACTION_SIZE).to(setting.device)
     stream = world.stream(first, context=setting.context)
     uncached = Uncached(world, first, setting.context)
     decode = world.codec.frame_decoder()
@@ -154,13 +163,13 @@ def difference(world: WorldModel, setting: Setting) -> float:
 
 def rows(setting: Setting) -> tuple[list[list[str]], float]:
     """The lines of the table for one number of steps, and the difference of the videos."""
-    first, context, seconds = setting.first_frame(), setting.context, setting.seconds
+    first, context = setting.first_frame(), setting.context
     world = random_world(setting, decoding=True)
     bare = random_world(setting, decoding=False)
     frames, steps = CLIP_FRAMES - 1, str(setting.steps)
-    stream = measure(lambda: world.stream(first, context=context).step, seconds)
-    cached = measure(lambda: bare.stream(first, context=context).step, seconds)
-    plain = measure(lambda: Uncached(bare, first, context).step, seconds)
+    stream = measure(lambda: world.stream(first, context=context).step, setting)
+    cached = measure(lambda: bare.stream(first, context=context).step, setting)
+    plain = measure(lambda: Uncached(bare, first, context).step, setting)
     lines = [[steps, "whole clip", f"{frames / whole_clip(world, setting):.1f}"]]
     for way, timing in (("stream", stream), ("· no codec", cached), ("· nor cache", plain)):
         half, most = np.percentile(timing.later, [50, 95]) * 1e3
@@ -180,17 +189,20 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64, help="side of the frames")
     parser.add_argument("--context", type=int, default=10, help="latent frames")
     parser.add_argument("--seconds", type=float, default=5.0, help="per measurement")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     for model in arguments.model or ["dit_xs"]:
         size, threads = arguments.size, arguments.threads
-        title = f"{model}, {size}×{size}, compact, float32, {threads} threads"
+        where = arguments.device if arguments.device != "cpu" else f"{threads} threads"
+        title = f"{model}, {size}×{size}, compact, float32, {where}"
         heads = ("steps", "way", "frames/s", "later on", "p50 ms", "p95 ms", "cache ×", "later on")
         table = Table(*heads, title=title)
         worst = 0.0
         for steps in map(int, arguments.steps.split(",")):
-            setting = Setting(model, steps, arguments.size, arguments.context, arguments.seconds)
+            wanted = (model, steps, size, arguments.context, arguments.seconds, arguments.device)
+            setting = Setting(*wanted)
             lines, apart = rows(setting)
             worst = max(worst, apart)
             for line in lines:
