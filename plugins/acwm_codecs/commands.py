@@ -1,4 +1,4 @@
-"""`acwm train-codec`: train the codec `compact` on your own data."""
+"""`acwm train-codec`: train the codec `compact` or `fine` on your own data."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
 @click.argument("data", nargs=-1, required=True, type=DATASET)
 @click.option("--out", type=OUT_FILE, required=True, help="Output .safetensors.")
 @click.option(
-    "--start",
+    "--codec",
     default="compact",
-    help="Initial weights: a file, compact (those that ship), or random.",
+    type=click.Choice(["compact", "fine"]),
+    help="Which codec.  [default: compact]",
+)
+@click.option(
+    "--start",
+    help="Initial weights: a file, random, or the codec's name, for those that ship (default).",
 )
 @click.option("--decoder-only", is_flag=True, help="Keep the encoder, and so the latents.")
 @click.option("--steps", default=2000, type=click.IntRange(1), help="Optimiser steps.")
@@ -37,12 +42,14 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
 @click.option(
     "--threads", default=0, type=click.IntRange(0), help="CPU threads; 0 leaves PyTorch's choice."
 )
-def train_codec(data: tuple[Path, ...], out: Path, **options: object) -> None:
-    """Train the codec compact on the training episodes of DATA.
+def train_codec(
+    data: tuple[Path, ...], out: Path, codec: str, start: str | None, **options: object
+) -> None:
+    """Train a codec on the training episodes of DATA.
 
-    Starts from the weights that ship and prints the gain on test episodes. Use the result in a
-    recipe with codec.weights=FILE.
+    Starts from the weights that ship and prints the gain on test episodes. If it is interrupted,
+    run the same command again to continue. Use the result in a recipe with codec.weights=FILE.
     """
-    from acwm_codecs.train_compact import train_on
+    from acwm_codecs.train_codec import train_on
 
-    train_on(data, out, **options)  # pyright: ignore[reportArgumentType]
+    train_on(data, out, codec=codec, start=start or codec, **options)  # pyright: ignore[reportArgumentType]

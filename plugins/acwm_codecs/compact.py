@@ -1,13 +1,14 @@
-"""`Compact`: a small causal video autoencoder whose trained weights ship with the package.
+"""`Compact` and `Fine`: small causal video autoencoders whose weights ship with the package.
 
-It folds the four video frames of each latent frame into channels (the first video frame is repeated
-four times) and applies two-dimensional convolutions. So latent frames are independent of each
-other, and the encoding of a prefix is the prefix of the encoding.
+They fold the four video frames of each latent frame into channels (the first video frame is
+repeated four times) and apply two-dimensional convolutions. So latent frames are independent of
+each other, and the encoding of a prefix is the prefix of the encoding.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -19,13 +20,10 @@ from acwm_core.errors import DataError
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Latent, Video, check_finite
 
-PACKAGED_WEIGHTS = Path(__file__).parent / "weights" / "compact.safetensors"
+WEIGHTS = Path(__file__).parent / "weights"
 
 STRIDE = 4
 """Video frames folded into one latent frame."""
-
-WIDTHS = (64, 128, 160)
-"""Channels at 1/2, 1/4 and 1/8 of the frame's resolution."""
 
 
 class ResidualBlock(nn.Module):
@@ -44,48 +42,35 @@ class ResidualBlock(nn.Module):
         return features + self.second(silu(self.first(silu(features))))
 
 
-def make_encoder(channels: int) -> nn.Sequential:
-    """Make the encoder, which maps `[N, 12, H, W]` to `[N, channels, H/8, W/8]`."""
-    fine, middle, coarse = WIDTHS
-    return nn.Sequential(
-        nn.Conv2d(3 * STRIDE, fine, 4, stride=2, padding=1),
-        ResidualBlock(fine),
-        nn.SiLU(),
-        nn.Conv2d(fine, middle, 4, stride=2, padding=1),
-        ResidualBlock(middle),
-        nn.SiLU(),
-        nn.Conv2d(middle, coarse, 4, stride=2, padding=1),
-        ResidualBlock(coarse),
-        ResidualBlock(coarse),
-        nn.SiLU(),
-        nn.Conv2d(coarse, channels, 1),
-    )
+def make_encoder(widths: Sequence[int], channels: int) -> nn.Sequential:
+    """Make the encoder, which maps `[N, 12, H, W]` to `[N, channels, h, w]`.
+
+    Args:
+        widths: channels at 1/2, 1/4, … of the frame's resolution, down to that of the latent.
+        channels: channels of the latent.
+    """
+    layers: list[nn.Module] = []
+    for before, width in zip((3 * STRIDE, *widths), widths, strict=False):
+        blocks = 2 if width == widths[-1] else 1
+        layers += [nn.Conv2d(before, width, 4, stride=2, padding=1)]
+        layers += [*(ResidualBlock(width) for _ in range(blocks)), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Conv2d(widths[-1], channels, 1))
 
 
-def make_decoder(channels: int) -> nn.Sequential:
-    """Make the decoder, which maps `[N, channels, h, w]` to `[N, 12, 8h, 8w]`."""
-    fine, middle, coarse = WIDTHS
-    return nn.Sequential(
-        nn.Conv2d(channels, coarse, 3, padding=1),
-        ResidualBlock(coarse),
-        ResidualBlock(coarse),
-        ResidualBlock(coarse),
-        nn.Conv2d(coarse, 4 * middle, 3, padding=1),
-        nn.PixelShuffle(2),
-        ResidualBlock(middle),
-        ResidualBlock(middle),
-        nn.Conv2d(middle, 4 * fine, 3, padding=1),
-        nn.PixelShuffle(2),
-        ResidualBlock(fine),
-        ResidualBlock(fine),
-        nn.SiLU(),
-        nn.Conv2d(fine, 4 * 3 * STRIDE, 3, padding=1),
-        nn.PixelShuffle(2),
-    )
+def make_decoder(widths: Sequence[int], channels: int) -> nn.Sequential:
+    """Make the decoder, which maps `[N, channels, h, w]` to `[N, 12, H, W]`; see `make_encoder`."""
+    coarse, *finer = reversed(widths)
+    layers: list[nn.Module] = [nn.Conv2d(channels, coarse, 3, padding=1)]
+    layers += [ResidualBlock(coarse) for _ in range(3)]
+    for before, width in zip((coarse, *finer), finer, strict=False):
+        layers += [nn.Conv2d(before, 4 * width, 3, padding=1), nn.PixelShuffle(2)]
+        layers += [ResidualBlock(width) for _ in range(2)]
+    last = nn.Conv2d(widths[0], 4 * 3 * STRIDE, 3, padding=1)
+    return nn.Sequential(*layers, nn.SiLU(), last, nn.PixelShuffle(2))
 
 
 class Compact(Codec):
-    """A small causal codec with strides 8×8×4, 16 latent channels and about 5 M parameters.
+    """``compact``: strides 8×8×4, 16 latent channels and about 5 M parameters.
 
     Args:
         weights: a safetensors file; by default the one that ships with the package. `random` keeps
@@ -94,6 +79,10 @@ class Compact(Codec):
     Raises:
         DataError: the file does not exist or does not hold the weights of this codec.
     """
+
+    name = "compact"
+    widths: tuple[int, ...] = (64, 128, 160)
+    """Channels at 1/2, 1/4, … of the frame's resolution, down to that of the latent."""
 
     channels = 16
     spatial_stride = 8
@@ -104,25 +93,31 @@ class Compact(Codec):
 
     def __init__(self, *, weights: str | None = None) -> None:
         super().__init__()
-        self.encoder = make_encoder(self.channels)
-        self.decoder = make_decoder(self.channels)
+        self.encoder = make_encoder(self.widths, self.channels)
+        self.decoder = make_decoder(self.widths, self.channels)
         # Without affine parameters its running statistics are the latent's mean and variance:
         # normalisation is learned during training and fixed in evaluation.
         self.normalise = nn.BatchNorm2d(self.channels, affine=False)
         if weights != "random":
-            self._load(Path(weights) if weights else PACKAGED_WEIGHTS)
+            self._load(Path(weights) if weights else self.shipped_weights())
             self.eval()  # normalise with trained statistics, not with those of the batch
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    @classmethod
+    def shipped_weights(cls) -> Path:
+        """The file of the weights that ship."""
+        return WEIGHTS / f"{cls.name}.safetensors"
 
     def _load(self, path: Path) -> None:
         try:
             state = load_file(path)
             self.load_state_dict({name: value.float() for name, value in state.items()})
         except FileNotFoundError:
-            raise DataError(f"codec 'compact': there is no weights file {path}") from None
+            raise DataError(f"codec '{self.name}': there is no weights file {path}") from None
         except (SafetensorError, RuntimeError) as error:
+            what = str(error).splitlines()[0]
             raise DataError(
-                f"codec 'compact': {path} does not hold its weights ({str(error).splitlines()[0]})"
+                f"codec '{self.name}': {path} does not hold its weights ({what})"
             ) from error
         check_finite(path, state)
 
@@ -141,11 +136,26 @@ class Compact(Codec):
         return groups.unflatten(0, latents.shape[:2]) / 2 + 0.5
 
     def fingerprint(self) -> str:
-        digest = hashlib.sha256(b"compact")
+        digest = hashlib.sha256(self.name.encode())
         for name, value in sorted(self.state_dict().items()):
             digest.update(name.encode())
             digest.update(value.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:12]
+
+
+class Fine(Compact):
+    """``fine``: strides 4×4×4, 16 latent channels and about 1.9 M parameters.
+
+    It has no third level, so objects of a few pixels keep their shape. A model that reads 2×2 of
+    its cells as one, by ``model.patch_size=2``, costs as much as one on `Compact`.
+
+    Args:
+        weights: see `Compact`.
+    """
+
+    name = "fine"
+    widths = (64, 128)
+    spatial_stride = 4
 
 
 def fold(video: Video) -> Tensor:

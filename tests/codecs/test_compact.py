@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from acwm_codecs.compact import PACKAGED_WEIGHTS, Compact, fold, unfold
+from acwm_codecs.compact import Compact, fold, unfold
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
@@ -61,8 +61,8 @@ def test_latents_of_real_video_are_normalised(codec):
 
 
 def test_the_weights_are_small_and_say_how_they_were_made():
-    assert PACKAGED_WEIGHTS.stat().st_size <= 10_000_000
-    record = training_record(PACKAGED_WEIGHTS)
+    assert Compact.shipped_weights().stat().st_size <= 10_000_000
+    record = training_record(Compact.shipped_weights())
     assert {"data", "seed", "steps", "batch", "peak_learning_rate"} <= record.keys()
 
 
@@ -80,7 +80,7 @@ def test_wrong_weights_are_refused_with_a_sentence(tmp_path):
 def test_weights_that_are_not_finite_are_refused(tmp_path):
     from safetensors.torch import load_file
 
-    weights = load_file(PACKAGED_WEIGHTS)
+    weights = load_file(Compact.shipped_weights())
     name = max(weights)
     weights[name].view(-1)[0] = math.nan
     save_file(weights, tmp_path / "nan.safetensors")

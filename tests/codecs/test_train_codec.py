@@ -1,4 +1,4 @@
-"""Training the compact codec: what it sees, what it counts, and that it learns."""
+"""Training codecs: what it sees, what it counts, and that it learns."""
 
 import math
 import re
@@ -8,15 +8,10 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from acwm_codecs import train_compact
-from acwm_codecs.compact import Compact
-from acwm_codecs.train_compact import (
-    RunningErrors,
-    learning_rate,
-    load_videos,
-    sample_groups,
-    train,
-)
+from acwm_codecs import train_codec
+from acwm_codecs.compact import Compact, Fine
+from acwm_codecs.frame_groups import load_videos, sample_groups
+from acwm_codecs.train_codec import RunningErrors, Training, detail_weights, learning_rate
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
 from acwm_core.env.environment import ActionSpec
@@ -64,8 +59,9 @@ def test_hard_sources_count_for_less_than_their_error_and_for_more_than_their_de
 @pytest.mark.slow
 def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
     torch.manual_seed(0)
-    codec = Compact(weights="random").train()
-    seen = [running.values.mean().item() for _, running in train(codec, SOURCES, 60, 4, 1e-3, 1, 0)]
+    codec = Fine(weights="random").train()
+    training = Training(codec, SOURCES, batch=4, seed=0)
+    seen = [training.running.values.mean().item() for _ in training.steps(60, 1e-3, 1)]
     assert seen[-1] < 0.35 * seen[0]
     groups, _ = sample_groups(SOURCES, 16, np.random.default_rng(9))
     with torch.inference_mode():
@@ -73,10 +69,40 @@ def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
     assert 0.4 < latents.std().item() < 2.5
 
 
+def test_motion_and_edges_count_for_more():
+    groups, _ = sample_groups(SOURCES[:1], 8, np.random.default_rng(0))
+    weights = detail_weights(groups)
+    assert weights.mean((1, 2, 3)).tolist() == pytest.approx([1] * 8)
+    changing = groups.unflatten(1, (4, 3)).std(1, keepdim=True).expand(-1, 4, -1, -1, -1) > 0.1
+    at_motion, elsewhere = weights[changing.flatten(1, 2)], weights[~changing.flatten(1, 2)]
+    assert at_motion.mean() > 1.5 * elsewhere.mean()
+
+
+def test_a_training_that_was_stored_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch):
+    monkeypatch.setattr(train_codec, "MEASURED_BATCHES", 2)
+
+    def training():
+        torch.manual_seed(0)
+        return Training(Fine(weights="random").train(), SOURCES, batch=2, seed=3)
+
+    whole, first, second = training(), training(), training()
+    assert list(whole.steps(4, 1e-3, 1)) == [1, 2, 3, 4]
+    for step in first.steps(4, 1e-3, 1):
+        if step == 2:
+            break
+    first.store(tmp_path / "x.training", {"a": 1})
+    with pytest.raises(DataError, match="other settings"):
+        second.restore(tmp_path / "x.training", {"a": 2})
+    second.restore(tmp_path / "x.training", {"a": 1})
+    assert list(second.steps(4, 1e-3, 1)) == [3, 4]
+    for name, value in whole.codec.state_dict().items():
+        assert torch.equal(second.codec.state_dict()[name], value), name
+
+
 @pytest.mark.ci
 def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
-    monkeypatch.setattr(train_compact, "MEASURED_BATCHES", 2)
+    monkeypatch.setattr(train_codec, "MEASURED_BATCHES", 2)
     generate(
         "reacher", tmp_path / "d", episodes={"train": 1, "ind_test": 1}, seed=3, size=64, workers=0
     )
