@@ -249,7 +249,8 @@ def train_on(
         raise DataError("--decoder-only keeps an encoder, so it cannot --start random")
     kind = CODECS[codec]
     file = kind.shipped_weights() if start == codec else Path(start)
-    sources = [load_videos(folder, episodes) for folder in data]
+    loaded = {folder: load_videos(folder, episodes) for folder in data}
+    sources = [loaded[folder] for folder in data]
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -265,7 +266,7 @@ def train_on(
         "of_steps": steps,
         **({"decoder_only": True} if decoder_only else {}),
     }
-    before = [reconstruction(trained, folder) for folder in data]
+    before = {folder: reconstruction(trained, folder) for folder in loaded}
     training = Training(trained, sources, batch=batch, seed=seed, decoder_only=decoder_only)
     state = out.with_suffix(".training")
     if state.exists():
@@ -281,7 +282,7 @@ def train_on(
             )
             click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {psnr}")
     state.unlink(missing_ok=True)
-    for folder, old in zip(data, before, strict=True):
+    for folder, old in before.items():
         if old is not None:
             now = reconstruction(kind(weights=str(out)), folder)
             click.echo(f"{folder}: {old:.2f} dB before and {now:.2f} dB now, on test episodes")
