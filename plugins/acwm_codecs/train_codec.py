@@ -41,9 +41,11 @@ WORST_WEIGHT = 0.02
 WORST_CELL = 8  # side of a cell, in pixels
 SPREAD_WEIGHT = 2e-4
 MEASURED_BATCHES = 64  # batches for the statistics of the latents
-WARM_UP = 50  # steps
+WARM_UP = 200  # steps
 TEST_EPISODES = 8  # episodes on which reconstructions are compared
 MEMORY = 0.95  # weight of the old value in the running error of a dataset
+NORM_MEMORY = 0.99  # weight of the old value in the running norm of the gradient
+CLIPPED_AT = 2.0  # gradients above this many running norms are clipped
 
 
 @torch.no_grad()
@@ -165,6 +167,7 @@ class Training:
         self.running = RunningErrors(len(sources))
         self._rng = np.random.default_rng(seed)
         self._noise = torch.Generator().manual_seed(seed)
+        self._norm = 0.0
         if decoder_only:
             codec.encoder.requires_grad_(False)
             codec.normalise.eval()
@@ -185,9 +188,16 @@ class Training:
             loss = (each * weights).sum() + SPREAD_WEIGHT * spread
             self._optimizer.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(self.codec.parameters(), 1.0)
+            self._clip()
             self._optimizer.step()
             yield self.step
+
+    def _clip(self) -> None:
+        """Clip the gradient relative to those before, as a rare one would undo a training."""
+        largest = CLIPPED_AT * self._norm if self.step > WARM_UP else math.inf
+        norm = float(nn.utils.clip_grad_norm_(self.codec.parameters(), largest))
+        mixed = NORM_MEMORY * self._norm + (1 - NORM_MEMORY) * min(norm, largest)
+        self._norm = mixed if self._norm else norm
 
     def store(self, path: Path, record: dict[str, Any]) -> None:
         """Write all that `restore` needs, with the record of the training."""
@@ -197,6 +207,7 @@ class Training:
             "codec": self.codec.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "running": self.running.values,
+            "norm": self._norm,
             "rng": json.dumps(self._rng.bit_generator.state),
             "noise": self._noise.get_state(),
         }
@@ -218,7 +229,7 @@ class Training:
         self.step = state["step"]
         self.codec.load_state_dict(state["codec"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self.running.values = state["running"]
+        self.running.values, self._norm = state["running"], state["norm"]
         self._rng.bit_generator.state = json.loads(state["rng"])
         self._noise.set_state(state["noise"])
 
