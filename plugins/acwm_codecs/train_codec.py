@@ -277,7 +277,8 @@ def train_on(
         "of_steps": steps,
         **({"decoder_only": True} if decoder_only else {}),
     }
-    before = {folder: reconstruction(trained, folder) for folder in loaded}
+    started = start != "random"
+    before = {folder: reconstruction(trained, folder) for folder in loaded if started}
     training = Training(trained, sources, batch=batch, seed=seed, decoder_only=decoder_only)
     state = out.with_suffix(".training")
     if state.exists():
@@ -293,10 +294,11 @@ def train_on(
             )
             click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {psnr}")
     state.unlink(missing_ok=True)
-    for folder, old in before.items():
-        if old is not None:
-            now = reconstruction(kind(weights=str(out)), folder)
-            click.echo(f"{folder}: {old:.2f} dB before and {now:.2f} dB now, on test episodes")
+    for folder in loaded:
+        now, old = reconstruction(kind(weights=str(out)), folder), before.get(folder)
+        if now is not None:
+            gain = "" if old is None else f"{old:.2f} dB before and "
+            click.echo(f"{folder}: {gain}{now:.2f} dB now, on test episodes")
     click.echo(f"{out}; use it by codec={codec} codec.weights={out}")
 
 
