@@ -7,21 +7,26 @@ _NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command that trains the codec `compact`."""
+    """Add the command that trains `compact` and `fine`."""
     registry.add(
         "train-codec",
         "acwm_codecs.commands:train_codec",
-        summary="train the codec compact on your own data",
+        summary="train the codec compact or fine on your own data",
     )
 
 
 @hookimpl
 def register_codecs(registry: Registry) -> None:
-    """Add codecs: three without downloads, those of published experiments, and any of diffusers."""
+    """Add codecs: four without downloads, those of published experiments, and any of diffusers."""
     registry.add(
         "compact",
         "acwm_codecs.compact:Compact",
         summary="small causal autoencoder with shipped weights: strides 8×8×4, 16 channels",
+    )
+    registry.add(
+        "fine",
+        "acwm_codecs.compact:Fine",
+        summary="the same at half its stride, for small objects: strides 4×4×4, 16 channels",
     )
     registry.add(
         "compact_per_frame",
