@@ -42,7 +42,7 @@ WORST_CELL = 8  # side of a cell, in pixels
 SPREAD_WEIGHT = 2e-4
 MEASURED_BATCHES = 64  # batches for the statistics of the latents
 WARM_UP = 200  # steps
-TEST_EPISODES = 8  # episodes on which reconstructions are compared
+TEST_PIXELS = 2_000_000  # of test episodes on which reconstructions are compared, but one whole
 MEMORY = 0.95  # weight of the old value in the running error of a dataset
 NORM_MEMORY = 0.99  # weight of the old value in the running norm of the gradient
 CLIPPED_AT = 2.0  # gradients above this many running norms are clipped
@@ -310,9 +310,15 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
     training, errors = codec.training, list[float]()
     codec.eval()
     tests = EpisodeDataset(folder, "ind_test")
-    for index in range(min(TEST_EPISODES, len(tests))):
+    pixels = 0
+    for index in range(len(tests)):
         video = torch.as_tensor(tests.video(index)).float()[None] / 255
-        errors.append((codec(video) - video).square().mean().item())
+        pixels += video[0, :, 0].numel()
+        if errors and pixels > TEST_PIXELS:
+            break
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            decoded = codec(video).float()
+        errors.append((decoded - video).square().mean().item())
     codec.train(training)
     return -10 * math.log10(max(float(np.mean(errors)), 1e-12))
 
