@@ -19,12 +19,12 @@ def weights(tmp_path_factory):
 
 
 def codec_of(name, request):
-    if name in ("compact", "identity"):
+    if name in ("compact", "fine", "identity"):
         return catalog().create("codec", name)
     return catalog().create("codec", name, weights=request.getfixturevalue("weights")[name])
 
 
-@pytest.mark.parametrize("name", ["compact", "identity", "wan", "wan_per_frame", "flux"])
+@pytest.mark.parametrize("name", ["compact", "fine", "identity", "wan", "wan_per_frame", "flux"])
 def test_a_stream_shows_what_its_latents_decode_to(name, request):
     codec = codec_of(name, request)
     model = catalog().create("model", "dit_xs", latent_channels=codec.channels, causal=True, **FIT)

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from safetensors.torch import load_file
 
 from acwm_codecs.compact import Compact
-from acwm_codecs.train_compact import save
+from acwm_codecs.train_codec import save
 from acwm_core.cli import main
 from acwm_core.errors import TrainingError
 from acwm_core.evaluation.results import Summary
