@@ -68,6 +68,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         self._frame_index = 0
         self._spec: EpisodeSpec | None = None
         self._factors: dict[str, FactorValue] = {}
+        self._ood_label: str | None = None
 
     # What an author writes ---------------------------------------------------------------------
 
@@ -151,6 +152,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             spec = EpisodeSpec(self.card.name, split, index, seed=0, factors=factors)
         self._spec = spec
         self._factors = draw_factors(spec, self.card.factors, self.card.ood_shifts)
+        self._ood_label = ood_label(self.card.factors, self._factors)
         self._frame_index = 0
         self._start(dict(self._factors), spec.rng("start"))
         if symmetry := options.get("symmetry"):
@@ -215,7 +217,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             # Not an array: its length would vary, and vector environments stack arrays.
             "contacts": tuple(contacts),
             "factors": dict(self._factors),
-            "ood_label": ood_label(self.card.factors, self._factors),
+            "ood_label": self._ood_label,
         }
 
     def still_action(self) -> NDArray[np.float32]:

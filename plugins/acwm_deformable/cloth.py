@@ -93,6 +93,8 @@ class Cloth:
         self._start, self._item = np.zeros(BUCKETS + 1, np.int32), np.zeros(count, np.int32)
         self._pairs = np.zeros((_MAX_PAIRS * count, 2), np.int32)
         self._strain = np.zeros(1, np.float32)
+        self._p, self._step = np.zeros(at.LENGTH, np.float32), np.zeros_like(self.hands)
+        self._launch = engine.Launcher(advance_cloth)
         self._count = np.zeros(1, np.int32)
         for hand, node in enumerate(held):
             if node >= 0:
@@ -118,11 +120,12 @@ class Cloth:
         Afterwards `touched` says what touched meanwhile: cloth and sphere, cloth and ground, then
         each gripper and the sphere.
         """
-        numbers = self._numbers(seconds / substeps, self.sheet.drag if drag < 0 else drag)
+        self._p[:] = self._numbers(seconds / substeps, self.sheet.drag if drag < 0 else drag)
         before = [array.copy() for array in (self.nodes, self.velocities, self.hands)]
         for share in _EFFORTS:
             self.touched[:] = 0
-            self._run(numbers, np.multiply(step, share, dtype=np.float32), substeps)
+            self._step[:] = np.multiply(step, share, dtype=np.float32)
+            self._run(substeps)
             if self._strain[0] <= MAX_STRAIN or not np.any(step):
                 break
             if share != _EFFORTS[-1]:
@@ -147,17 +150,17 @@ class Cloth:
         for points in (self.nodes, self.hands):
             points[:, :2] += inward
 
-    def _run(self, numbers: NDArray[np.float32], step: NDArray[np.float32], substeps: int) -> None:
-        advance_cloth(
+    def _run(self, substeps: int) -> None:
+        self._launch(
             self.nodes,
             self._old,
             self.velocities,
             self._free,
-            numbers,
+            self._p,
             self.held,
             self.hands,
             self._offset,
-            step,
+            self._step,
             self._wish,
             self._start,
             self._item,

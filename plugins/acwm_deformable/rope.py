@@ -73,6 +73,9 @@ class Rope:
         self._old, self._drag = np.empty_like(self.nodes), np.zeros_like(self.nodes)
         self._tension = np.zeros(NODES - 1, np.float32)
         self._work, self._band = np.empty((NODES, 4), np.float32), np.empty((NODES, 3), np.float32)
+        self._p, self._move = np.zeros(at.LENGTH, np.float32), np.zeros(2, np.float32)
+        self._touched = np.zeros(1, np.int32)
+        self._launch = engine.Launcher(advance_rope)
         self._pairs, self._count = np.zeros((_MAX_PAIRS, 2), np.int32), np.zeros(1, np.int32)
 
     def advance(
@@ -89,8 +92,9 @@ class Rope:
         touched meanwhile.
         """
         goal = np.clip(self.pole + np.asarray(move, np.float32), -_LIMIT, _LIMIT)
-        touched = np.zeros(1, np.int32)
-        advance_rope(
+        self._p[:], self._move[:] = self._numbers(seconds / substeps), goal - self.pole
+        self._touched[:] = 0
+        self._launch(
             self.nodes,
             self._old,
             self.velocities,
@@ -100,14 +104,14 @@ class Rope:
             self._band,
             self._pairs,
             self._count,
-            self._numbers(seconds / substeps),
+            self._p,
             self.pole,
-            goal - self.pole,
-            touched,
+            self._move,
+            self._touched,
             substeps,
             passes,
         )
-        self.touched = bool(touched[0])
+        self.touched = bool(self._touched[0])
 
     def _numbers(self, dt: float) -> NDArray[np.float32]:
         """The kernel's argument `p`."""

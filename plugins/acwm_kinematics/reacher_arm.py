@@ -64,8 +64,7 @@ class Arm:
     def advance(self, torque: Vector, seconds: float) -> None:
         """Apply constant torques ([2], N·m) for some seconds."""
         self.data.ctrl[:] = torque
-        for _ in range(round(seconds / TIMESTEP)):
-            mujoco.mj_step(self.model, self.data)
+        mujoco.mj_step(self.model, self.data, nstep=round(seconds / TIMESTEP))
 
     def snapshot(self) -> Callable[[], None]:
         """A function that returns to this moment."""

@@ -138,12 +138,12 @@ class Reacher:
         """Number of frames for a motion that stays within a random share of the torque limits."""
         room = self.rng.uniform(0.45, 0.9) * np.abs(self.limits).min()
         for frames in range(_FASTEST, _SLOWEST):
-            path = [_motion(start, rate, end, frames, k) for k in range(frames + 1)]
-            torques = [
+            path = (_motion(start, rate, end, frames, k) for k in range(frames + 1))
+            torques = (
                 self.arm.torque_for((a + c) / 2, (b + d) / 2, (d - b) / _FRAME)
                 for (a, b), (c, d) in itertools.pairwise(path)
-            ]
-            if np.abs(torques).max() <= room:
+            )
+            if all(np.abs(torque).max() <= room for torque in torques):
                 return frames
         return _SLOWEST
 

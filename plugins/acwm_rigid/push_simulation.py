@@ -91,10 +91,12 @@ class PushSimulation:
         steps = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None, None]
         path = self.reference + gap * np.minimum(1.0, steps * (MAX_SPEED * TIMESTEP) / reach)
         self.reference = path[-1]
+        model, data, step = self.model, self.data, mujoco.mj_step
+        control = data.ctrl
         for point in path.reshape(len(path), -1):
-            self.data.ctrl[:] = point
-            mujoco.mj_step(self.model, self.data)
-            meetings.add(self.data.contact.geom.tobytes())
+            control[:] = point
+            step(model, data)
+            meetings.add(data.contact.geom.tobytes())
         geoms = np.frombuffer(b"".join(meetings), np.int32).reshape(-1, 2)
         return {(a, b) for a, b in self._instance[geoms].tolist() if min(a, b) > 0}
 

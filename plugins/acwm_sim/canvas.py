@@ -1,12 +1,14 @@
 """The arrays behind one view of a scene: the baked static parts, and each frame drawn on top."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_sim import view
 from acwm_sim.camera import Camera, Light, Vec3
+from acwm_sim.engine import Launcher
 from acwm_sim.kernels.clear_frame import draw_clear
 from acwm_sim.kernels.opaque_frame import draw_frame, measure_tiles
 from acwm_sim.kernels.raster import FAR
@@ -47,31 +49,35 @@ class Canvas:
         self._make_arrays()
         still = np.zeros((len(self._static), 12), np.float32)
         still[:, 3::4] = 1
-        self._still_points = self._draw(self._static, still, 1, self._frame, self._mask, True)
+        points, bounds = _projected(self._static)
+        self._still_points = points
+        self._draw(draw_frame, self._static, still, points, bounds, True)
         for array in (self._depth, self._surface, self._label, self._shadow[:2]):
             array[1] = array[0]
         if self._clear:
             self._base[1] = self._base[0]
             self._bare[:] = self._mask
             self._shadow[5:7] = self._shadow[2:4]
-            nothing = Parts()
-            points, bounds = np.empty((0, 9), np.float32), np.empty((0, 9), np.float32)
-            self._lay(nothing, points, bounds, self._frame, self._mask)
+            self._lay(draw_clear, Parts(), *_projected(Parts()))
+        self._background = self._frame.copy(), self._mask.copy()
         measure_tiles(self._view, self._depth, self._surface, self._side, self._still)
         self._tiles[:] = 0
 
     def draw(self, pose: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """The frame [H, W, 3] and mask [H, W] with the moving parts at `pose` [N, 12]."""
-        frame, mask = self._frame.copy(), self._mask.copy()
+        self._frame[:], self._mask[:] = self._background
         if len(self._moving):
+            self._pose[:] = pose
             np.copyto(self._shadow[0], self._shadow[1])
             if self._moving.fluid is not None:
                 view.pack_fluid(self._view, self._moving.fluid)
             if self._clear:
                 np.copyto(self._shadow[2:4], self._shadow[5:7])
                 self._shadow[4] = 0
-            self._draw(self._moving, pose, 1 + len(self._static), frame, mask, False)
-        return frame, mask
+            self._draw(
+                self._draw_frame, self._moving, self._pose, self._points, self._bounds, False
+            )
+        return self._frame.copy(), self._mask.copy()
 
     def _make_arrays(self) -> None:
         (rows, columns), (height, width), texels = self._grid, self._size, self._texels
@@ -81,6 +87,8 @@ class Canvas:
         self._still = np.zeros((*self._cover, 7), np.float32)
         self._deep = np.zeros((*self._cover, 4), np.float32)
         self._tiles = np.ones(self._cover, np.int32)
+        self._marks = np.zeros(self._cover, np.int32)
+        self._cells = np.zeros((64, 64), np.int32)
         self._frame = np.zeros((height, width, 3), np.uint8)
         self._mask = np.zeros((height, width), np.uint8)
         self._shadow = np.full((LAYERS if self._clear else 2, texels, texels), FAR, np.float32)
@@ -92,20 +100,25 @@ class Canvas:
             self._pool[::2] = FAR
             self._panes = np.zeros((2, height, width, 6), np.float32)
             self._front = np.full((2, rows, columns), FAR, np.float32)
+            self._glow = np.empty((len(self._moving.vertices), 6), np.float32)
+            self._still_glow = np.empty((len(self._static.vertices), 6), np.float32)
+        self._pose = np.zeros((len(self._moving), 12), np.float32)
+        self._points, self._bounds = _projected(self._moving)
+        self._draw_frame, self._draw_clear = Launcher(draw_frame), Launcher(draw_clear)
 
     def _draw(
         self,
+        launch: Callable[..., None],
         parts: Parts,
         pose: NDArray[np.float32],
-        first: int,
-        frame: NDArray[np.uint8],
-        mask: NDArray[np.uint8],
+        points: NDArray[np.float32],
+        bounds: NDArray[np.float32],
         everything: bool,
-    ) -> NDArray[np.float32]:
-        points = np.empty((len(parts.vertices), 9), np.float32)
-        bounds = np.empty((len(parts), 9), np.float32)
+    ) -> None:
         self._deep[..., ::2], self._deep[..., 1::2] = FAR, -FAR
-        draw_frame(
+        self._marks.fill(0)
+        self._cells.fill(0)
+        launch(
             self._view,
             parts.table,
             pose,
@@ -120,33 +133,31 @@ class Canvas:
             self._shadow,
             self._still,
             self._tiles,
-            np.zeros(self._cover, np.int32),
+            self._marks,
             self._deep,
-            np.zeros((64, 64), np.int32),
+            self._cells,
             _GAMMA,
             self._base,
             self._bare,
-            frame,
-            mask,
+            self._frame,
+            self._mask,
             self._side,
             self.rate,
-            first,
+            1 if everything else 1 + len(self._static),
             int(everything),
         )
         if self._clear and not everything:
-            self._lay(parts, points, bounds, frame, mask)
-        return points
+            self._lay(self._draw_clear, parts, points, bounds)
 
     def _lay(
         self,
+        launch: Callable[..., None],
         parts: Parts,
         points: NDArray[np.float32],
         bounds: NDArray[np.float32],
-        frame: NDArray[np.uint8],
-        mask: NDArray[np.uint8],
     ) -> None:
         """Draw glass and fluid over a frame whose opaque parts are drawn."""
-        draw_clear(
+        launch(
             self._view,
             parts.table,
             parts.vertices,
@@ -154,12 +165,12 @@ class Canvas:
             parts.balls,
             points,
             bounds,
-            np.empty((len(points), 6), np.float32),
+            self._glow,
             self._static.table,
             self._static.vertices,
             self._static.triangles,
             self._still_points,
-            np.empty((len(self._still_points), 6), np.float32),
+            self._still_glow,
             self._depth,
             self._shadow,
             self._base,
@@ -168,9 +179,14 @@ class Canvas:
             self._front,
             self._tiles,
             _GAMMA,
-            frame,
-            mask,
+            self._frame,
+            self._mask,
             self._side,
             self._cell,
             self.rate,
         )
+
+
+def _projected(parts: Parts) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Room for the `points` and the `bounds` of parts."""
+    return np.empty((len(parts.vertices), 9), np.float32), np.empty((len(parts), 9), np.float32)

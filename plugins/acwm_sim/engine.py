@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import operator
 import os
 import tempfile
 import threading
@@ -10,6 +11,8 @@ import warnings
 from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from acwm_core.errors import AcwmError, AcwmWarning
 from acwm_sim.shell import undisturbed
@@ -32,7 +35,7 @@ except ImportError as error:
         ) from error
     raise
 
-__all__ = ["CACHE", "start", "ti"]
+__all__ = ["CACHE", "Launcher", "start", "ti"]
 
 # Taichi reads the source of a function at each of its calls, and draws each expression as text for
 # the case of an error: more than half of the time before the first frame. Neither ends in a kernel.
@@ -80,6 +83,52 @@ def start() -> None:
         # torch and an environment it is not. Unlike atexit, Finalize also runs in workers.
         Finalize(None, ti.reset, exitpriority=0)
     _started_in = os.getpid()
+
+
+class Launcher:
+    """Launches a kernel again and again over the same arrays.
+
+    Taichi examines every argument at each call of a kernel: for some twenty arrays that takes as
+    long as drawing a small frame. A launcher lets it do so only when an argument is another object
+    than at the previous launch. So what changes from launch to launch belongs into an array.
+
+    Args:
+        kernel: a Taichi kernel that returns nothing. Its arguments are contiguous arrays, integers,
+            numbers, and templates.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel._primal
+        self._arguments: tuple[Any, ...] = ()
+
+    def __call__(self, *arguments: Any) -> None:
+        if len(self._arguments) != len(arguments) or not all(
+            map(operator.is_, arguments, self._arguments)
+        ):
+            self._prepare(arguments)
+        self._program.launch_kernel(self._compiled, self._context)
+
+    def _prepare(self, arguments: tuple[Any, ...]) -> None:
+        """What Taichi's own call does before a launch."""
+        built = self._kernel.compiled_kernels[self._kernel.ensure_compiled(*arguments)]
+        program: Any = impl.get_runtime().prog
+        context, place = built.make_launch_context(), 0
+        for argument, declared in zip(arguments, self._kernel.arguments, strict=True):
+            if isinstance(declared.annotation, ti.template):
+                continue
+            if isinstance(argument, np.ndarray):
+                assert argument.flags.c_contiguous
+                shape = argument.shape[: declared.annotation.ndim]
+                address, size = int(argument.ctypes.data), argument.nbytes
+                context.set_arg_external_array_with_shape((place,), address, size, shape, 0)
+            elif declared.annotation is ti.i32:
+                context.set_arg_int((place,), int(argument))
+            else:
+                context.set_arg_float((place,), float(argument))
+            place += 1
+        self._program, self._context, self._arguments = program, context, arguments
+        device = program.get_device_caps()
+        self._compiled = program.compile_kernel(program.config(), device, built)
 
 
 def _initialise() -> None:

@@ -5,7 +5,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from acwm_sim import engine
+from acwm_sim.kernels.arrays import F1, F2
+
+ti = engine.ti
+
+
+@ti.kernel
+def add_rows(rows: F2, total: F1, times: ti.i32, scale: ti.f32, first: ti.template()):
+    ti.loop_config(serialize=True)
+    for i in range(first, rows.shape[0]):
+        for k in ti.static(range(3)):
+            total[k] += times * scale * rows[i, k]
 
 
 def run(code, **env):
@@ -22,6 +36,17 @@ def test_starting_twice_is_harmless_and_silent():
     result = run("from acwm_sim import engine; engine.start(); engine.start()")
     assert result.returncode == 0
     assert result.stdout == ""
+
+
+def test_a_launcher_follows_its_arrays_and_takes_others():
+    engine.start()
+    launch, rows, total = engine.Launcher(add_rows), np.ones((4, 3), np.float32), np.zeros(3, "f4")
+    launch(rows, total, 2, 0.5, 1)
+    rows[3] = 10, 20, 30  # in place, so nothing is looked at anew
+    launch(rows, total, 2, 0.5, 1)
+    np.testing.assert_array_equal(total, [15, 25, 35])
+    launch(rows[2:].copy(), total, 1, 2.0, 0)
+    np.testing.assert_array_equal(total, [37, 67, 97])
 
 
 @pytest.mark.parametrize(
