@@ -17,6 +17,7 @@ help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 install: $(VENV)/installed-all  ## Install acwm with all extras and the tools of development
+	@echo "acwm is installed in $(VENV): source $(BIN)/activate, then acwm list"
 
 demo: $(VENV)/installed-rigid  ## Simulate, train, evaluate and report, at small scale
 	$(BIN)/acwm demo
@@ -88,7 +89,7 @@ $(VENV)/checked: $(BIN)/pip
 	@touch $@
 
 $(VENV)/torch: $(VENV)/checked constraints.txt
-	@echo "installing torch (a few minutes)"
+	@echo "installing torch, some hundred megabytes (a minute or more)"
 	@if [ "$$(uname)" = Linux ] && ! command -v nvidia-smi >/dev/null; then \
 	  $(PIP) --retries 0 --timeout 15 install -c constraints.txt torch --extra-index-url $(TORCH_INDEX) 2>/dev/null \
 	    || $(PIP) install -c constraints.txt torch; \
@@ -98,11 +99,11 @@ $(VENV)/torch: $(VENV)/checked constraints.txt
 	@touch $@
 
 $(VENV)/installed-rigid: $(VENV)/torch pyproject.toml
-	@echo "installing acwm[rigid]"
+	@echo "installing acwm with the simulators of rigid bodies: acwm[rigid] (a minute or more)"
 	@$(PIP) install -c constraints.txt -e '.[rigid]'
 	@touch $@
 
 $(VENV)/installed-all: $(VENV)/torch pyproject.toml
-	@echo "installing acwm[all,dev,docs]"
+	@echo "installing acwm with all extras and the tools of development: acwm[all,dev,docs] (minutes)"
 	@$(PIP) install -c constraints.txt -e '.[all,dev,docs]'
 	@touch $@ $(VENV)/installed-rigid

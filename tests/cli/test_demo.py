@@ -1,5 +1,6 @@
 """The demo, rehearsed at its smallest, and again: what is finished is not done twice."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,8 +8,9 @@ import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
+from acwm_core.recipe import compose
 from acwm_core.training.signals import StoppedEarly
-from acwm_zoo.demo import _fit
+from acwm_zoo import demo
 
 
 @pytest.mark.slow
@@ -19,13 +21,14 @@ def test_demo_runs_and_goes_on(tmp_path: Path) -> None:
     report = tmp_path / "report.html"
     assert report.stat().st_size > 10_000
     assert first.stdout.rstrip().endswith(str(report))
+    assert first.stderr.index(f"open {report} now") < first.stderr.index("training for")
     for word in ("ind_test", "ood_test", "`other actions`", "codec", "psnr dB"):
         assert word in first.stdout
     weights = (tmp_path / "run" / "model.safetensors").read_bytes()
 
     again = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert again.exit_code == 0
-    assert again.stderr.count("was done before") == 3  # training and both predictions
+    assert again.stderr.count("was done before") == 6  # all but the last page
     assert again.stdout == first.stdout
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == weights
 
@@ -36,5 +39,34 @@ def test_ctrl_c_advises_the_same_command(tmp_path, monkeypatch):
 
     monkeypatch.setattr("acwm_core.training.fit.fit", fit)
     with pytest.raises(StoppedEarly, match="saved step 3; run the same command again") as raised:
-        _fit(SimpleNamespace(trainer={"max_steps": 5}), tmp_path / "run")
+        demo._fit(SimpleNamespace(trainer={"max_steps": 5}), tmp_path / "run")
     assert raised.value.exit_code == 130
+
+
+def test_the_time_left_is_that_of_all_steps(monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(demo.time, "monotonic", lambda: clock[0])
+
+    def taking(seconds: float, done: bool = True) -> Callable[[], bool]:
+        def work() -> bool:
+            clock[0] += seconds
+            return done
+
+        return work
+
+    demo._work_through(
+        demo.Step("done before", 120, taking(0, done=False)),
+        demo.Step("twice as slow as expected", 60, taking(120)),
+        demo.Step("the rest", 240, taking(480)),
+    )
+    told = [line for line in capsys.readouterr().err.splitlines() if "left" in line]
+    assert [line.split("about ")[1] for line in told] == [
+        f"{minutes} min left in all" for minutes in (7, 5, 8)
+    ]
+
+
+def test_data_that_was_made_before_is_told_so(tmp_path):
+    recipe = compose("demo", [f"data.path={tmp_path}"])
+    assert demo._generate(recipe, tmp_path, {"ind_test": 1})
+    assert not demo._generate(recipe, tmp_path, {"ind_test": 1})
+    assert demo._generate(recipe, tmp_path, {"train": 1})

@@ -83,3 +83,17 @@ def test_without_libx11_one_sentence_names_the_package(tmp_path):
     done = make("demo", f"VENV={tmp_path / 'venv'}")
     assert done.returncode == 2
     assert "libX11 is missing: sudo apt-get install libx11-6" in done.stderr
+
+
+def test_install_says_what_it_does_and_what_comes_next(tmp_path):
+    """A `.venv` whose Python does whatever it is asked to."""
+    folder = tmp_path / "venv" / "bin"
+    folder.mkdir(parents=True)
+    for name in ("pip", "python"):
+        (folder / name).write_text("#!/bin/sh\n")
+        (folder / name).chmod(0o755)
+    torch, rest, done = make("install", f"VENV={tmp_path / 'venv'}").stdout.splitlines()
+    assert "torch" in torch
+    assert "acwm[all,dev,docs]" in rest
+    assert f"source {folder}/activate" in done
+    assert make("install", f"VENV={tmp_path / 'venv'}").stdout.splitlines() == [done]
