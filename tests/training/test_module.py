@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.module import TrainingModule, generator_of, seed_of
+from acwm_core.training.module import COMPILED_LENGTHS, TrainingModule, generator_of, seed_of
 from acwm_core.training.optimizers import parameter_groups
 from tests.tiny import tiny_world_model
 
@@ -77,6 +77,15 @@ def test_clips_start_later_in_as_many_steps_as_asked(monkeypatch):
     assert seen == parts_seen(range(100), monkeypatch, random_starts=0.6)
     both = parts_seen(range(50), monkeypatch, random_starts=0.6, growing_horizon=1.0)
     assert all(4 <= last - first <= 27 for first, last in both)
+
+
+def test_compiled_models_see_few_lengths(monkeypatch):
+    """Of 24 that a growing horizon and random starts give; the whole clip is among them."""
+    seen = parts_seen(range(100), monkeypatch, growing_horizon=0.9, random_starts=0.3, compile=True)
+    lengths = {last - first for first, last in seen}
+    assert max(lengths) == 27
+    assert min(lengths) == 4
+    assert 5 <= len(lengths) <= COMPILED_LENGTHS + 1
 
 
 class Recorder(L.Callback):
