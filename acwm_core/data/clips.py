@@ -42,6 +42,9 @@ class DataConfig:
             same, and a larger fraction contains all episodes of a smaller one.
         validation_episodes: episodes held out from the end of `train` for the validation loss; a
             tenth by default, at most 32.
+        states: fields of the state that the model learns to predict too, so that it knows where the
+            agent is: what a robot knows of itself, e.g. ``[joint_position]``. Rollouts are given
+            none.
         symmetries: train on each clip also as the symmetries on the card of the data transform it:
             push_cube, which has seven, gives eight times as many clips. Validation does not.
         growing: train on the episodes that a running `acwm generate` has finished, and look for
@@ -63,6 +66,7 @@ class DataConfig:
     window_stride: int = 4
     fraction: float = 1.0
     validation_episodes: int | None = None
+    states: tuple[str, ...] = ()
     symmetries: bool = False
     growing: bool = False
     cache_latents: bool = True
@@ -77,6 +81,8 @@ class DataConfig:
             value = getattr(self, name)
             if value is not None and value < minimum:
                 raise RecipeError(f"data.{name}={value} must be at least {minimum}")
+        if self.states and self.reader != "random_access":
+            raise RecipeError("data.states are read by data.reader=random_access only")
         if self.growing and (self.fraction != 1 or self.reader != "random_access"):
             raise RecipeError(
                 "data.growing takes all that there is by data.reader=random_access: leave out "
@@ -210,6 +216,12 @@ def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDA
     return window
 
 
+def window_states(states: NDArray[np.float32], start: int, frames: int) -> NDArray[np.float32]:
+    """The states `[frames, S]` of a window; after the end of the episode, its last ones."""
+    window = states[start : start + frames]
+    return np.concatenate([window, window[-1:].repeat(frames - len(window), 0)])
+
+
 class Clips(ABC):
     """The windows of a split's episodes as a map-style dataset of clips.
 
@@ -224,6 +236,7 @@ class Clips(ABC):
         per_length: how many clips should share a length, as those of a batch do; see
             `shared_lengths`.
         symmetries: of the environment; each window gives one more clip by each of them.
+        states: names of fields of the state; batches then hold them.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
@@ -242,15 +255,18 @@ class Clips(ABC):
         given: int = 1,
         per_length: int = 1,
         symmetries: Sequence[Symmetry] = (),
+        states: Sequence[str] = (),
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
+        self._fields = tuple(states)
         self.versions: tuple[Symmetry | None, ...] = (None, *symmetries)
         windows = list_windows(episodes.lengths, frames, stride, indices)
         self.windows = windows.repeat(len(self.versions), axis=0)
         self.lengths = clip_lengths(
             self.windows, episodes.lengths, frames, temporal_stride, given, per_length
         )
-        self._actions: dict[int, NDArray[np.float32]] = {}  # of recently used episodes
+        # Actions and fields of the state of recently used episodes.
+        self._read: dict[int, tuple[NDArray[np.float32], list[NDArray[np.float32]]]] = {}
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -263,37 +279,61 @@ class Clips(ABC):
         """One clip: the arrays of `batch` without the batch axis."""
         return {name: values[0] for name, values in self.batch([index]).items()}
 
-    @abstractmethod
     def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
         """Read clips of one length as a batch, which is faster than one by one.
+
+        Returns:
+            The frames, see the class; ``actions`` float32 ``[B, T, A]``, last rows zero; and
+            ``states`` float32 ``[B, T, S]``, if fields of the state were asked for.
 
         Raises:
             DataError: a shard is missing or damaged.
         """
+        import torch
+
+        frames = common_length(self.lengths, indices)
+        rows = [self._inputs(int(index), frames) for index in indices]
+        stacked = {name: torch.as_tensor(np.stack([r[name] for r in rows])) for name in rows[0]}
+        return {**self._frames(indices, frames), **stacked}
+
+    @abstractmethod
+    def _frames(self, indices: Sequence[int], frames: int) -> dict[str, Tensor]:
+        """What shows the first `frames` frames of some clips."""
+
+    def _remember(self, episode: int) -> None:
+        """Read the actions and states of an episode."""
+        fields = [self.episodes.states(episode, [name]) for name in self._fields]
+        self._read[episode] = self.episodes.actions(episode), fields
+
+    def _inputs(self, index: int, frames: int) -> dict[str, NDArray[np.float32]]:
+        """Actions and states of a clip."""
+        episode, start = map(int, self.windows[index])
+        symmetry = self.version(index)
+        if episode not in self._read:
+            if len(self._read) == 2**14:  # a limit for memory; they are small
+                self._read.clear()
+            self._remember(episode)
+        actions, fields = self._read[episode]
+        rows = {"actions": window_actions(actions, start, frames)}
+        if symmetry:
+            rows["actions"] = symmetry.of_actions(rows["actions"])
+            fields = [symmetry.of_states(*each) for each in zip(self._fields, fields, strict=True)]
+        if fields:
+            rows["states"] = window_states(np.concatenate(fields, 1), start, frames)
+        return rows
 
 
 class ClipDataset(Clips):
-    """Clips as video."""
+    """Clips as video, ``video`` uint8 ``[B, T, 3, H, W]``."""
 
-    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """`video` uint8 ``[B, T, 3, H, W]``, `actions` float32 ``[B, T, A]``, last rows zero."""
+    def _frames(self, indices: Sequence[int], frames: int) -> dict[str, Tensor]:
         import torch
 
-        frames, card = common_length(self.lengths, indices), self.episodes.card.environment
-        video = np.empty((len(indices), frames, 3, *card.frame_size), np.uint8)
-        actions = np.empty((len(indices), frames, card.action.size), np.float32)
+        size = self.episodes.card.environment.frame_size
+        video = np.empty((len(indices), frames, 3, *size), np.uint8)
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
         for row, (episode, start) in enumerate(windows):
             self.episodes.video_into(video[row], episode, start)
-            actions[row] = window_actions(self._actions_of(episode), start, frames)
             if symmetry := self.version(indices[row]):
                 video[row] = symmetry.of_frames(video[row]).copy()
-                actions[row] = symmetry.of_actions(actions[row])
-        return {"video": torch.as_tensor(video), "actions": torch.as_tensor(actions)}
-
-    def _actions_of(self, episode: int) -> NDArray[np.float32]:
-        if episode not in self._actions:
-            if len(self._actions) == 2**14:  # a limit for memory; actions are small
-                self._actions.clear()
-            self._actions[episode] = self.episodes.actions(episode)
-        return self._actions[episode]
+        return {"video": torch.as_tensor(video)}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.card import MANIFEST, DatasetCard
 from acwm_core.data.remote import data_folder, fetch_shard, origin
-from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, open_shard
+from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, from_npz, open_shard
 from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.symmetry import Symmetry
@@ -183,6 +183,20 @@ class EpisodeDataset:
         """The raw actions of an episode, ``[T, A]``."""
         reader, position = self._locate(index)
         return reader.array(position, "actions.npy")
+
+    def states(self, index: int, names: Sequence[str]) -> NDArray[np.float32]:
+        """The values of some fields of the state of an episode, side by side, ``[T, S]``.
+
+        Raises:
+            DataError: the episode lacks one of them.
+        """
+        reader, position = self._locate(index)
+        fields = reader.decoded(position, "states.npz", from_npz)
+        missing = [name for name in names if name not in fields]
+        if missing:
+            raise DataError(f"episode {index} of {self.split} of {self.path} has no {missing[0]}")
+        rows = [fields[name].reshape(self.lengths[index], -1) for name in names]
+        return np.concatenate(rows, 1, dtype=np.float32, casting="unsafe")
 
     def damage(self, index: int) -> str | None:
         """Why an episode cannot be read, if it cannot; all its bytes are checked."""

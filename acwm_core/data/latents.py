@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from acwm_core.data.clips import Clips, common_length, padded_video, window_actions, window_starts
+from acwm_core.data.clips import Clips, padded_video, window_starts
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError, noting
@@ -209,14 +209,14 @@ def _encode_shared(codec: Codec, video: Tensor, starts: range, frames: int) -> T
 
 
 class LatentClipDataset(Clips):
-    """The latents that `encode_windows` wrote, with the clips' actions.
+    """The latents that `encode_windows` wrote: ``latents`` float16 ``[B, L, C, h, w]``.
 
     Args:
         episodes: the split they come from.
         fingerprint: of the codec, `Codec.fingerprint()`.
         temporal_stride: as in `Clips`.
-        windows: `frames` and `stride`, as they were encoded, and `indices`, `given`, `per_length`
-            and `symmetries`, as in `Clips`.
+        windows: `frames` and `stride`, as they were encoded, and `indices`, `given`, `per_length`,
+            `symmetries` and `states`, as in `Clips`.
 
     Raises:
         DataError: these windows have not been encoded by that codec, or a shard is damaged.
@@ -250,32 +250,20 @@ class LatentClipDataset(Clips):
         self._rows = [sum(counts[first : first + count]) for first, count in episodes.shards]
         self._layouts: dict[Path, tuple[int, tuple[int, ...]]] = {}
         for episode in map(int, np.unique(self.windows[:, 0])):
-            self._actions[episode] = episodes.actions(episode)
+            self._remember(episode)
 
-    def batch(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """`latents` float16 ``[B, L, C, h, w]``, `actions` float32 ``[B, T, A]``, last rows zero.
-
-        Raises:
-            DataError: the latents are damaged.
-        """
-        frames = common_length(self.lengths, indices)
+    def _frames(self, indices: Sequence[int], frames: int) -> dict[str, Tensor]:
         # In a window padded with repeated frames, latents before the padding do not depend on it.
         kept = None if frames == self.frames else 1 + (frames - 1) // self._temporal_stride
-        latents, actions = list[NDArray[np.float16]](), list[NDArray[np.float32]]()
+        latents = list[NDArray[np.float16]]()
         windows: list[tuple[int, int]] = self.windows[list(indices)].tolist()
         for index, (episode, start) in zip(indices, windows, strict=True):
             folder = self._folders[index % len(self._folders)]
             shard, row = self._places[episode]
-            latents.append(self._read(folder, shard, row + start // self.stride, kept))
-            taken = window_actions(self._actions[episode], start, frames)
-            symmetry = folder.symmetry
-            actions.append(symmetry.of_actions(taken) if symmetry else taken)
-        return {
-            "latents": torch.as_tensor(np.stack(latents)),
-            "actions": torch.as_tensor(np.stack(actions)),
-        }
+            latents.append(self._window(folder, shard, row + start // self.stride, kept))
+        return {"latents": torch.as_tensor(np.stack(latents))}
 
-    def _read(
+    def _window(
         self, folder: LatentFolder, shard: int, row: int, kept: int | None
     ) -> NDArray[np.float16]:
         """A window's latents, or the first `kept` of them, `[L, C, h, w]`.

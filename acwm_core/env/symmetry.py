@@ -77,6 +77,17 @@ class Symmetry:
         """The transformed actions of ``[…, A]``."""
         return permuted(actions, self.actions)
 
+    def of_states(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
+        """The transformed values of a field of the state, ``[T, S]``, its axes side by side.
+
+        Raises:
+            ShapeError: it is not said how the field is transformed.
+        """
+        if name not in self.states:
+            raise ShapeError(f"the symmetry {self.name} does not say how it transforms {name}")
+        axes = self.states[name]
+        return permuted(values.reshape(len(values), -1, len(axes)), axes).reshape(values.shape)
+
     def after(self, first: Symmetry) -> Symmetry | None:
         """This symmetry after the `first` one; None if frames are then as they were.
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, cast
 
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors import PluginError
+from acwm_core.errors import PluginError, RecipeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
@@ -14,6 +16,7 @@ from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, Recipe
+from acwm_core.recipe.signature import signature
 
 ComponentT = TypeVar("ComponentT")
 
@@ -43,13 +46,29 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
     card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
     objective = build_objective(recipe.objective)
-    model = build_model(recipe.model, objective, codec.channels)
+    states = state_size(recipe.data.get("states", ()), card)
+    model = build_model(recipe.model, objective, codec.channels, states)
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
     bounds = card.action.low, card.action.high
     clips = {name: recipe.data[name] for name in ("clip_frames", "context_frames")}
+    clips["state_size"] = states
     return WorldModel(codec, model, conditioner, objective, *bounds, **clips)
+
+
+def state_size(names: Sequence[str], card: EnvironmentCard) -> int:
+    """Number of values of some fields of the state.
+
+    Raises:
+        RecipeError: there is no such field.
+    """
+    shapes = {field.name: field.shape for field in card.state}
+    for name in names:
+        if name not in shapes:
+            known = ", ".join(shapes) or "none at all"
+            raise RecipeError(f"data.states: {card.name} has no state {name!r}, but {known}")
+    return sum(math.prod(shapes[name]) for name in names)
 
 
 def build_codec(choice: ComponentConfig) -> Codec:
@@ -67,13 +86,26 @@ def build_objective(choice: ComponentConfig) -> Objective[Any]:
 
 
 def build_model(
-    choice: ComponentConfig, objective: Objective[Any], latent_channels: int
+    choice: ComponentConfig, objective: Objective[Any], latent_channels: int, state_size: int = 0
 ) -> DynamicsModel:
-    """Build the dynamics model that a recipe names, as the objective needs it."""
+    """Build the dynamics model that a recipe names, as the objective needs it.
+
+    Raises:
+        RecipeError: there are states to learn, which the model or the objective cannot.
+    """
     wanted = {"causal": objective.causal, "inputs": objective.inputs}
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
-    model = build_component("model", choice, DynamicsModel, latent_channels=latent_channels)
+    fitted = {"latent_channels": latent_channels}
+    if state_size:
+        made_of = catalog().component("model", choice.name).load()
+        if not objective.learns_states or "state_size" not in signature(made_of).parameters:
+            raise RecipeError(
+                f"model={choice.name} with {type(objective).__name__} learns no states of the "
+                "agent: leave out data.states, or choose a model that does"
+            )
+        fitted["state_size"] = state_size
+    model = build_component("model", choice, DynamicsModel, **fitted)
     objective.check_model(model)
     return model
 

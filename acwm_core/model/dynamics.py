@@ -5,13 +5,16 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.shapes import Latent, Sigmas
+
+if TYPE_CHECKING:
+    from acwm_core.model.objectives.objective import Batch
 
 InputKind = Literal["latent", "level"]
 """A further input of a denoiser: latents `[B, L, C, h, w]`, or a number in [0, 1] for each latent
@@ -141,6 +144,9 @@ class Predictor(DynamicsModel):
     `stream`: one CPU generator per clip, its only source of randomness. Its stream draws as
     `forward` does, so that the future stays the same one.
 
+    One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
+    which the framework fills in, and implements `state_loss`.
+
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
     """
@@ -159,6 +165,13 @@ class Predictor(DynamicsModel):
         Returns:
             `[B, L − K, C, h, w]`.
         """
+
+    def state_loss(self, batch: Batch) -> Tensor:
+        """The loss of what it knows of the agent's `batch.states`, a scalar. Optional.
+
+        States are known in training only; `forward` has to do without.
+        """
+        raise RecipeError(f"{type(self).__name__} learns no states: leave out data.states")
 
     def stream(self, given: Latent, *, context: int) -> LatentStream:
         """Predict one latent frame at a time, without end. Optional, for causal models.

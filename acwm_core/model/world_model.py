@@ -38,6 +38,7 @@ class WorldModel(nn.Module):
         action_high: upper bounds; both are used to normalise actions to [-1, 1].
         clip_frames: number of frames of a training clip.
         context_frames: number of given first frames of a clip; they must be whole latent frames.
+        state_size: number of values of the agent's state that the model learns too.
 
     Raises:
         RecipeError: `context_frames` are no whole latent frames, or leave nothing to predict.
@@ -45,6 +46,8 @@ class WorldModel(nn.Module):
 
     action_low: Tensor
     action_high: Tensor
+    state_mean: Tensor
+    state_std: Tensor
 
     def __init__(
         self,
@@ -57,6 +60,7 @@ class WorldModel(nn.Module):
         *,
         clip_frames: int = CLIP_FRAMES,
         context_frames: int = 1,
+        state_size: int = 0,
     ) -> None:
         super().__init__()
         stride = codec.temporal_stride
@@ -70,6 +74,9 @@ class WorldModel(nn.Module):
         self.model, self.conditioner, self.objective = model, conditioner, objective
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
+        # Needed in training only: `TrainingModule` sets them.
+        self.register_buffer("state_mean", torch.zeros(state_size), persistent=False)
+        self.register_buffer("state_std", torch.ones(state_size), persistent=False)
 
     def train(self, mode: bool = True) -> WorldModel:
         """Like `nn.Module.train`, but the frozen codec stays in evaluation mode."""
@@ -113,7 +120,11 @@ class WorldModel(nn.Module):
         return self.codec.encode(video)
 
     def loss(
-        self, latents: Latent, actions: Actions, generators: Sequence[torch.Generator] = ()
+        self,
+        latents: Latent,
+        actions: Actions,
+        generators: Sequence[torch.Generator] = (),
+        states: Tensor | None = None,
     ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
@@ -121,13 +132,17 @@ class WorldModel(nn.Module):
             latents: clean latents `[B, L, C, h, w]`; L exceeds the number of given latent frames.
             actions: raw actions of the clip's T frames, `[B, T, A]`.
             generators: one CPU generator per clip, for its noise; by default seeded from torch's.
+            states: raw states of the clip's T frames to learn from, `[B, T, S]`.
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         rows = self._prepare(actions, latents.shape[1])
         conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
         known = self.codec.latent_frames(self.context_frames)
-        return self.objective.loss(self.model, Batch(latents, conditioning, generators), known)
+        if states is not None:
+            states = (states[:, :: self.codec.temporal_stride] - self.state_mean) / self.state_std
+        batch = Batch(latents, conditioning, generators, states)
+        return self.objective.loss(self.model, batch, known)
 
     def rollout(
         self,

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from acwm_core.data.dataset import EpisodeDataset, declared_symmetries
 from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
 from acwm_core.data.loader import ClipLoader, ClipSampler, InOrder
 from acwm_core.data.streaming import ClipStream
-from acwm_core.errors import AcwmWarning, TrainingError
+from acwm_core.errors import AcwmWarning, DataError, TrainingError
 from acwm_core.model.codec import Codec
 
 NOT_RESUMABLE = (
@@ -51,6 +52,7 @@ class ClipData(L.LightningDataModule):
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
         self._split = self._divided()
         self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
+        self._check_states()
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
@@ -59,6 +61,34 @@ class ClipData(L.LightningDataModule):
         successive = self.frames - config.context_frames
         self._stride = successive if config.clip_starts == "episode" else config.window_stride
         self._cached = config.cache_latents and compresses(codec) and not self._streams
+
+    def _check_states(self) -> None:
+        """Refuse fields of the state that the data lacks, or whose symmetry is not known."""
+        card = self.episodes.card.environment
+        for name in self.config.states:
+            known = [field.name for field in card.state]
+            if name not in known:
+                raise DataError(
+                    f"data.states: {self.episodes.path} has no state {name!r}, but "
+                    f"{', '.join(known) or 'none at all'}"
+                )
+            for symmetry in self._symmetries:
+                if name not in symmetry.states:
+                    raise DataError(
+                        f"data.states: the symmetry {symmetry.name} of {card.name} does not say "
+                        f"how it transforms {name}: leave out {name}, or data.symmetries"
+                    )
+
+    def state_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the states to learn, `[S]` each, over training episodes.
+
+        Of a value that never changes, the deviation is one.
+        """
+        names = self.config.states
+        rows = np.concatenate([self.episodes.states(each, names) for each in self._split[0]])
+        mean, std = rows.mean(0, dtype=np.float64), rows.std(0, dtype=np.float64)
+        std[std < 1e-6 * np.abs(mean) + 1e-12] = 1
+        return torch.tensor(mean, dtype=torch.float32), torch.tensor(std, dtype=torch.float32)
 
     def _divided(self) -> tuple[Sequence[int], range]:
         """The episodes to train on, and those that are held out."""
@@ -184,6 +214,7 @@ class ClipData(L.LightningDataModule):
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
             "given": self.config.context_frames,
+            "states": self.config.states,
             **of_clips,
         }
         if not cached:

@@ -45,7 +45,8 @@ COMPILED_LENGTHS = 6
 
 Batch = Mapping[str, Any]
 """``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": [B]}``, where positions are the
-clips' places in the stream; or ``"video"``, uint8 `[B, T, 3, H, W]`, instead of the latents."""
+clips' places in the stream; or ``"video"``, uint8 `[B, T, 3, H, W]`, instead of the latents; and
+``"states"`` `[B, T, S]` if there are some to learn."""
 
 
 class TrainingModule(L.LightningModule):
@@ -77,6 +78,14 @@ class TrainingModule(L.LightningModule):
         self.gradient_norm: Tensor | None = None
         self._losses: list[Tensor] = []
 
+    def setup(self, stage: str) -> None:
+        """Take the scale of the states to learn from the data."""
+        if len(self.world_model.state_mean):
+            data = cast(Any, self.trainer).datamodule
+            mean, std = data.state_scale()
+            self.world_model.state_mean.copy_(mean)
+            self.world_model.state_std.copy_(std)
+
     def configure_model(self) -> None:
         """Set up activation checkpointing, compilation and sharding as the recipe says."""
         layers, compiles = trained_layers(self.world_model), self.config.compile
@@ -101,9 +110,9 @@ class TrainingModule(L.LightningModule):
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         with noting(f"in training step {self.global_step + 1}", *self.world_model.children()):
-            latents, actions = self._trained_part(self.latents(batch), batch["actions"])
+            latents, actions, states = self._trained_part(batch)
             self.trained_on = len(actions), actions.shape[1]
-            loss = self.world_model.loss(latents, actions, generators)
+            loss = self.world_model.loss(latents, actions, generators, states)
         if not loss.requires_grad:
             name = type(self.world_model.model).__name__
             raise TrainingError(
@@ -146,25 +155,36 @@ class TrainingModule(L.LightningModule):
             return batch["latents"].to(self.dtype)
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
 
-    def _trained_part(self, latents: Latent, actions: Actions) -> tuple[Latent, Actions]:
-        """The part of the clips that this step uses: random start, and the current horizon."""
-        codec, config, whole = self.world_model.codec, self.config, latents.shape[1]
+    def _trained_part(self, batch: Batch) -> tuple[Latent, Actions, Tensor | None]:
+        """The part of the clips that this step uses: random start, and the current horizon.
+
+        Returns:
+            Latents, actions, and the states to learn, if there are some.
+        """
+        codec, config, latents = self.world_model.codec, self.config, self.latents(batch)
+        whole = latents.shape[1]
         shortest = codec.latent_frames(self.world_model.context_frames) + SHORTEST_HORIZON
-        spare = whole - shortest
+        spare, start = whole - shortest, 0
         if spare > 0 and config.random_starts:
             random = generator_of(config.seed, TRAIN_STARTS, self.global_step)
             if torch.rand((), generator=random) < config.random_starts:
                 start = int(torch.randint(1, spare + 1, (), generator=random))
-                latents, actions = latents[:, start:], actions[:, start * codec.temporal_stride :]
                 spare -= start
         growth = config.growing_horizon * self.trainer.max_steps
         if spare > 0 and self.global_step < growth:
             kept = shortest + int(spare * self.global_step / growth)
-            latents = latents[:, :kept]
-        kept = latents.shape[1]
+        else:
+            kept = whole - start
         if config.compile and shortest < kept < whole:
             kept -= (kept - shortest) % -(-(whole - shortest) // COMPILED_LENGTHS)
-        return latents[:, :kept], actions[:, : codec.video_frames(kept)]
+        first = start * codec.temporal_stride
+        rows = slice(first, first + codec.video_frames(kept))
+        states = batch.get("states")
+        return (
+            latents[:, start : start + kept],
+            batch["actions"][:, rows],
+            None if states is None else states[:, rows],
+        )
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning-rate schedule that is updated every step."""

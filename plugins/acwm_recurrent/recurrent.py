@@ -11,7 +11,9 @@ from torch.nn import functional
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
+from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.shapes import Latent
+from acwm_recurrent.agent import Agent, AgentPath
 from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
 
 START_CELLS, STEP_CELLS = 4, 2
@@ -25,11 +27,13 @@ class State(NamedTuple):
         grid: features of each place, `[B, channels, h, w]`.
         vector: features of the whole scene, `[B, width]`.
         base: the given latent frame that predictions are relative to, `[B, C, h, w]`.
+        agent: what is known of the agent, `[B, S]` and `[B, hidden]`; empty without states.
     """
 
     grid: Tensor
     vector: Tensor
     base: Tensor
+    agent: tuple[Tensor, ...] = ()
 
 
 class RecurrentModel(Predictor):
@@ -38,20 +42,29 @@ class RecurrentModel(Predictor):
     The state has two parts. The grid has a cell for each patch of the latent; the coordinates of
     the cells are among its inputs. The vector is updated by a GRU from the embedded actions and the
     pooled grid. Residual convolution blocks, modulated by the vector, update the grid. A predicted
-    frame is the given frame plus what a last convolution reads from the grid.
+    frame is the given frame plus what further blocks and a last convolution read from the grid.
+
+    The blocks that read serve all frames at once, and cost less than those of a step. Without
+    blocks of a step, the grid stays that of the given frame and only the vector moves: enough where
+    all that moves is the agent.
+
+    With the agent's states to learn from (`data.states`), it also knows the agent by its state
+    alone, see `AgentPath`, and both kinds of block are told.
 
     With several given frames it starts from the last one and from the change just before it, which
     shows velocities.
 
     Args:
         latent_channels: channels C of the codec.
+        state_size: number of values S of the agent's state; 0 if there are none to learn.
         channels: channels of the grid.
         width: size of the vector and of the conditioner's modulation.
         blocks: number of residual blocks per step.
+        reading_blocks: number of residual blocks that read a frame from the grid.
         patch_size: side of a patch in latent pixels.
 
     Raises:
-        RecipeError: a size below 1.
+        RecipeError: a size below 1, or a model without blocks.
     """
 
     layers, heads = 0, 1
@@ -61,16 +74,21 @@ class RecurrentModel(Predictor):
         self,
         *,
         latent_channels: int,
+        state_size: int = 0,
         channels: int = 64,
         width: int = 192,
         blocks: int = 2,
+        reading_blocks: int = 0,
         patch_size: int = 1,
     ) -> None:
         super().__init__()
-        if min(channels, width, blocks, patch_size) < 1:
+        if min(channels, width, patch_size) < 1 or min(blocks, reading_blocks) < 0:
             raise RecipeError(
-                "channels, width, blocks and patch_size of a recurrent model must be at least 1"
+                "channels, width and patch_size of a recurrent model must be at least 1, and its "
+                "numbers of blocks at least 0"
             )
+        if not blocks + reading_blocks:
+            raise RecipeError("a recurrent model needs blocks, or reading_blocks")
         self.latent_channels = latent_channels
         self.width = width
         self.patch_size = patch_size
@@ -81,22 +99,33 @@ class RecurrentModel(Predictor):
         self.read_grid = nn.Linear(channels * STEP_CELLS**2, width)
         self.gru = nn.GRUCell(2 * width, width)
         self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
+        self.reading_blocks = nn.ModuleList(
+            FilmBlock(channels, width) for _ in range(reading_blocks)
+        )
         self.head = MatrixConv(channels, channels)
         self.out = nn.Conv2d(channels, patch_values, 1)
         for parameter in self.out.parameters():
             nn.init.zeros_(parameter)
+        self.agent = AgentPath(latent_channels, state_size, width) if state_size else None
 
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
         """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`."""
         known = given.shape[1]
         actions = self.actions(conditioning)
         state = self.start(given, actions[:, 0])
-        grids: list[Tensor] = []
+        grids, modulations = list[Tensor](), list[Tensor]()
         for frame in range(known, frames):
-            state = self.step(state, actions[:, frame])
+            state, modulation = self.step(state, actions[:, frame])
             grids.append(state.grid)
-        changes = self._read(torch.stack(grids, 1).flatten(0, 1)).unflatten(0, (len(given), -1))
+            modulations.append(modulation)
+        grid, modulation = (torch.stack(each, 1).flatten(0, 1) for each in (grids, modulations))
+        changes = self._read(grid, modulation).unflatten(0, (len(given), -1))
         return state.base[:, None] + changes
+
+    def state_loss(self, batch: Batch) -> Tensor:
+        """The loss of what it knows of the agent; see `AgentPath.loss`."""
+        assert self.agent is not None
+        return self.agent.loss(batch, self.actions(batch.conditioning))
 
     def stream(self, given: Latent, *, context: int) -> LatentStream:
         """Stream from the state. `context` is ignored, as the state holds all that is known."""
@@ -132,42 +161,50 @@ class RecurrentModel(Predictor):
         grid = grid.contiguous(memory_format=torch.channels_last)
         pooled = functional.adaptive_avg_pool2d(grid, START_CELLS).flatten(1)
         vector = torch.tanh(self.start_vector(pooled) + first)
-        return State(self.start_block(grid, vector), vector, base)
+        agent = self.agent.start(base) if self.agent else ()
+        return State(self.start_block(grid, vector), vector, base, agent)
 
-    def step(self, state: State, action: Tensor) -> State:
-        """The state one latent frame later.
+    def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
+        """The state one latent frame later, and the modulation `[B, width]` that reads it.
 
         Args:
             state: state of the previous frame.
             action: the embedded actions that lead to the next frame, `[B, width]`.
         """
+        agent = state.agent
+        if self.agent:
+            # Only true states teach it: the picture's error must not bend what is known of it.
+            with torch.no_grad():
+                agent = self.agent.step(Agent(*agent), action)
+            action = action + self.agent.embed(agent.state)
         pooled = functional.adaptive_avg_pool2d(state.grid, STEP_CELLS).flatten(1)
         vector = self.gru(torch.cat([action, self.read_grid(pooled)], -1), state.vector)
         grid = state.grid
         for block in self.blocks:
             grid = block(grid, vector + action)
-        return State(grid, vector, state.base)
+        return State(grid, vector, state.base, agent), vector + action
 
-    def frame(self, state: State) -> Tensor:
-        """Read the latent frame from a state, `[B, C, h, w]`."""
-        return state.base + self._read(state.grid).to(state.base)
-
-    def initial_state(self, given: Latent, conditioning: Conditioning) -> State:
-        """The first state of a stream that begins with latents `[B, K, C, h, w]`.
+    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
+        """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors.
 
         `conditioning` starts at the first latent frame, and may be longer.
         """
-        return self.start(given, self.actions(conditioning)[:, 0])
+        return _tensors(self.start(given, self.actions(conditioning)[:, 0]))
 
     def next_state(
         self, state: tuple[Tensor, ...], conditioning: Conditioning
-    ) -> tuple[Latent, State]:
+    ) -> tuple[Latent, tuple[Tensor, ...]]:
         """The next latent frame `[B, 1, C, h, w]` and its state, given the last conditioning."""
-        moved = self.step(State(*state), self.actions(conditioning)[:, -1])
-        return self.frame(moved)[:, None], moved
+        grid, vector, base, *agent = state
+        before = State(grid, vector, base, tuple(agent))
+        moved, modulation = self.step(before, self.actions(conditioning)[:, -1])
+        frame = base + self._read(moved.grid, modulation).to(base)
+        return frame[:, None], _tensors(moved)
 
-    def _read(self, grid: Tensor) -> Tensor:
+    def _read(self, grid: Tensor, modulation: Tensor) -> Tensor:
         grid = grid.contiguous(memory_format=torch.channels_last)
+        for block in self.reading_blocks:
+            grid = block(grid, modulation)
         # As a matrix, a 1×1 kernel has gradients of its own strides, as DDP's buckets want them.
         kernel = self.out.weight.flatten(1)[..., None, None]
         read = functional.silu(self.head(channel_norm(grid)))
@@ -194,7 +231,7 @@ class _RecurrentStream(LatentStream):
     def __init__(self, model: RecurrentModel, given: Latent) -> None:
         self._model = model
         self._given = given
-        self._state: State | None = None
+        self._state: tuple[Tensor, ...] | None = None
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
@@ -202,6 +239,10 @@ class _RecurrentStream(LatentStream):
             self._state = self._model.initial_state(self._given, conditioning)
         latent, self._state = self._model.next_state(self._state, conditioning)
         return latent
+
+
+def _tensors(state: State) -> tuple[Tensor, ...]:
+    return (*state[:3], *state.agent)
 
 
 def _coordinates(cells: Tensor) -> Tensor:

@@ -12,32 +12,12 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Predictor
 from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.objectives.regression import Regression
-from acwm_core.model.world_model import DECODED_TOGETHER, WorldModel
-from acwm_core.plugins import catalog
+from acwm_core.model.world_model import DECODED_TOGETHER
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.optimizers import build_optimizer
 from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.recurrent import RecurrentModel
-
-BOUNDS = [-1.0, -1.0], [1.0, 1.0]
-
-
-def world_codec(stride=4):
-    return catalog().create("codec", "identity", temporal_stride=stride)
-
-
-def world_of(model, stride=4):
-    codec = world_codec(stride)
-    conditioner = catalog().create(
-        "conditioner",
-        "adaln",
-        action_size=2,
-        temporal_stride=stride,
-        width=model.width,
-        layers=model.layers,
-        heads=model.heads,
-    )
-    return WorldModel(codec, model, conditioner, Regression(), *BOUNDS)
+from tests.recurrent.dots import moving_dots, world_codec, world_of
 
 
 @pytest.fixture
@@ -164,18 +144,6 @@ def test_wrong_sizes_are_refused():
         model(torch.zeros(1, 1, 3, 8, 8), bare, 2)
     with pytest.raises(RecipeError, match="set conditioner=adaln"):
         model(torch.zeros(1, 1, 4, 8, 8), Conditioning(None, None, None), 2)
-
-
-def moving_dots(batch, seed):
-    """Latents `[B, 6, 2, 8, 8]` of a dot that actions move by whole cells, and these actions."""
-    generator = torch.Generator().manual_seed(seed)
-    moves = torch.randint(-1, 2, (batch, 6, 2), generator=generator)
-    place = torch.randint(2, 6, (batch, 1, 2), generator=generator)
-    places = (place + functional.pad(moves[:, :-1], (0, 0, 1, 0)).cumsum(1)) % 8
-    latents = torch.zeros(batch, 6, 2, 8, 8)
-    b, t = torch.meshgrid(torch.arange(batch), torch.arange(6), indexing="ij")
-    latents[b, t, 0, places[..., 0], places[..., 1]] = 4.0
-    return latents, moves.float()
 
 
 def test_it_learns_to_move_what_actions_move():

@@ -26,11 +26,14 @@ class Batch:
         latents: clean latent frames `[B, L, C, h, w]`; of a beginning, the given ones alone.
         conditioning: the embedded actions of whole clips.
         generators: one CPU generator per clip, the only source of randomness.
+        states: the agent's states in each latent frame, to learn from, `[B, L, S]`, each value with
+            mean 0 and deviation 1 over the training data; None if there are none.
     """
 
     latents: Latent
     conditioning: Conditioning
     generators: Sequence[torch.Generator]
+    states: Tensor | None = None
 
     def noise(self, frames: int) -> Latent:
         """Standard normal noise `[B, frames, C, h, w]`, of the latents' type and device."""
@@ -70,12 +73,14 @@ class Objective(ABC, Generic[ModelT]):
         inputs: what it gives a denoiser beside noisy latents and their noise levels: further
             latents or levels, by name (`Denoiser.inputs`).
         steps: default number of network evaluations per prediction; None if there is no choice.
+        learns_states: whether it trains on the agent's states too, see `Batch.states`.
     """
 
     trains: type[ModelT]
     causal: bool = False
     inputs: Mapping[str, InputKind] = {}
     steps: int | None = None
+    learns_states: bool = False
 
     @abstractmethod
     def loss(self, model: ModelT, batch: Batch, known: int) -> Tensor:

@@ -20,15 +20,23 @@ class Regression(Objective[Predictor]):
     """Mean squared error of the predicted latents, with gradients through the whole clip.
 
     A model therefore predicts means: what cannot be known becomes blurred.
+
+    Args:
+        state_weight: weight of the model's loss of the agent's states, if it learns some.
     """
 
     trains = Predictor
+    learns_states = True
+
+    def __init__(self, *, state_weight: float = 0.3) -> None:
+        self.state_weight = state_weight
 
     def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
         given, true = batch.latents[:, :known], batch.latents[:, known:]
         predicted = _predicted(model, replace(batch, latents=given), batch.latents.shape[1])
-        return functional.mse_loss(predicted.float(), true.float())
+        loss = functional.mse_loss(predicted.float(), true.float())
+        return loss if batch.states is None else loss + self.state_weight * model.state_loss(batch)
 
     def predict(
         self, model: Predictor, given: Batch, frames: int, steps: int | None = None
