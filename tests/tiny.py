@@ -455,6 +455,8 @@ def tiny_recipe(data, /, **sections) -> Recipe:
     parts = {"env": "world", "codec": "codec", "model": "model", "conditioner": "conditioner"}
     chosen = {section: {"name": f"tiny_{name}"} for section, name in parts.items()}
     chosen |= {name: {**defaults[name], **sections.get(name, {})} for name in defaults}
+    if "name" in sections.get("objective", {}):  # another one, with parameters of its own
+        chosen["objective"] = sections["objective"]
     for name in parts:
         chosen[name] |= sections.get(name, {})
     return Recipe.from_dict(chosen)

@@ -51,7 +51,8 @@ class AgentPath(nn.Module):
             nn.SiLU(),
             nn.Conv2d(64, 64, 3, padding=1),
             nn.SiLU(),
-            nn.Conv2d(64, 96, 3, stride=2, padding=1),
+            nn.AdaptiveAvgPool2d(CELLS),
+            nn.Conv2d(64, 96, 3, padding=1),
             nn.SiLU(),
         )
         self.see = nn.Sequential(
@@ -71,7 +72,7 @@ class AgentPath(nn.Module):
     def read(self, frame: Tensor) -> Tensor:
         """The state that a latent frame `[B, C, h, w]` shows, `[B, S]`."""
         grid = self.look(frame.contiguous(memory_format=torch.channels_last))
-        return self.see(functional.adaptive_avg_pool2d(grid, CELLS).flatten(1)).float()
+        return self.see(grid.flatten(1)).float()
 
     def begin(self, state: Tensor) -> Agent:
         """The agent in a state `[B, S]`, as if at rest."""
