@@ -16,6 +16,11 @@ WHOLE = ("data.clip_frames=301", "data.clip_starts=episode")
 RECURRENT = ("+recurrent", "training.optimizer=muon", "training.learning_rate=4e-3")
 SLOWER = ("+recurrent", "training.optimizer=muon", "training.learning_rate=2e-3")
 
+FINE = (*SLOWER, "model.channels=96", "codec=fine", "model.patch_size=2")
+READING = ("model.blocks=0", "model.reading_blocks=5")
+"""The grid stays that of the given frame, and all frames are read from it at once."""
+JOINTS = "data.states=[joint_position]"
+
 VARIANTS: dict[str, tuple[str, ...]] = {
     BASE: (),
     "predict velocity, loss on velocity": (
@@ -70,6 +75,15 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "recurrent, growing horizon, random starts": RECURRENT,
     "recurrent, growing horizon, random starts, 96 channels": (*RECURRENT, "model.channels=96"),
     "recurrent, half the rate": SLOWER,
+    "fine codec": FINE,
+    "fine codec, read at once": (*FINE, *READING),
+    "fine codec, read at once, joints": (*FINE, *READING, JOINTS),
+    "fine codec, one block and three, joints": (
+        *FINE,
+        "model.blocks=1",
+        "model.reading_blocks=3",
+        JOINTS,
+    ),
 }
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_core.model.objectives.objective import Batch, drawn_noise
+from acwm_core.model.objectives.objective import Batch, drawn_noise, sent
 
 CELLS = 4
 """Cells per side to which a frame's features are pooled before the state is read from them."""
@@ -101,7 +101,7 @@ class AgentPath(nn.Module):
         states = batch.states
         assert states is not None
         read = functional.mse_loss(self.read(batch.latents.flatten(0, 1)), states.flatten(0, 1))
-        noise = drawn_noise(states.shape[2:], batch.generators).to(states)
+        noise = sent(drawn_noise(states.shape[2:], batch.generators), states)
         agent, moved = self.begin(states[:, 0] + START_NOISE * noise), list[Tensor]()
         for frame in range(1, states.shape[1]):
             agent = self.step(agent, actions[:, frame])
