@@ -11,11 +11,11 @@ import acwm
 
 SIGNATURES = {
     "ClipDataset": "(episodes, *, frames=37, stride=4, indices=None, temporal_stride=None, "
-    "given=1, per_length=1, symmetries=())",
+    "given=1, per_length=1, symmetries=(), states=())",
     "EpisodeDataset": "(path, split, *, growing=False)",
     "Recipe": "(env, codec, model, conditioner, objective, training, data, evaluation, trainer)",
     "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
-    "clip_frames=37, context_frames=1)",
+    "clip_frames=37, context_frames=1, state_size=0)",
     "build_world_model": "(recipe, card)",
     "compose": "(recipe, overrides=(), *, sections=None, trusted=None)",
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",
@@ -32,7 +32,7 @@ SIGNATURES = {
 
 OF_A_WORLD_MODEL = {
     "encode": "(self, video)",
-    "loss": "(self, latents, actions, generators=())",
+    "loss": "(self, latents, actions, generators=(), states=None)",
     "rollout": "(self, given, actions, *, mode=None, steps=None, window=None, seeds=None, "
     "check=True)",
     "stream": "(self, given, actions=None, *, steps=None, context=None, seeds=None)",
