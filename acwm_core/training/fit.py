@@ -44,6 +44,7 @@ from acwm_core.training.threads import use_threads
 from acwm_core.training.throughput import Throughput
 from acwm_core.training.tracking import begin, tracking
 from acwm_core.training.trainer import build_trainer
+from acwm_core.training.verdict import first_decides
 
 
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
@@ -71,11 +72,13 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
     """
     silence_irrelevant_warnings()
     run = RunFolder(run_dir if resume in (None, AUTO) else resume)
-    with _quiet_after_the_first(), claimed(run):
+    with _quiet_after_the_first(), contextlib.ExitStack() as claim:
         growing = recipe.data.get("growing", False)
         episodes = EpisodeDataset(recipe.data["path"], "train", growing=growing)
         _check_environment(recipe, episodes.card)
-        checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
+        with first_decides():
+            claim.enter_context(claimed(run))
+            checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
         first_step = read_step(checkpoint) if checkpoint else 0
         if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
             loggers = build_loggers(run, recipe.trainer, first_step)

@@ -4,6 +4,7 @@ So the numbers are wrong, but who takes which clips, how many steps there are, a
 holds are those of a real training.
 """
 
+import contextlib
 import multiprocessing
 import os
 
@@ -13,6 +14,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
 
+from acwm_core.training import fit as training
 from acwm_core.training.fit import fit
 from tests.tiny import tiny_recipe
 
@@ -68,6 +70,7 @@ def _train(pipe, data, folder, strategy, world, rank):
     # A fake group would deliver garbage as objects, and has no gloo beside it.
     distributed.broadcast_object_list = lambda *_, **__: None
     distributed.new_group = lambda *_, **__: distributed.group.WORLD
+    training.first_decides = contextlib.nullcontext  # nobody else is there to hear it
     Facts.pipe = pipe
     flags = {"devices": NODE, "num_nodes": nodes, "strategy": strategy, "max_steps": STEPS}
     flags |= {"enable_checkpointing": False, "accumulate_grad_batches": 2, "precision": "32-true"}

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -85,6 +86,50 @@ def test_two_ranks_resume_exactly(data, tmp_path):
     done = train(data, "", resume=run.path, spared=True, **recipe)
     assert done.returncode == 0, done.stderr
     assert_same(whole, run)
+
+
+def slurm(rank, port):
+    """What `srun` tells a process of two on one node."""
+    facts = {"JOB_ID": "1", "JOB_NAME": "job", "NTASKS": "2", "NTASKS_PER_NODE": "2"}
+    facts |= {"NODEID": "0", "NNODES": "1", "PROCID": f"{rank}", "LOCALID": f"{rank}"}
+    return {
+        **{f"SLURM_{name}": value for name, value in facts.items()},
+        **{"MASTER_ADDR": "localhost", "MASTER_PORT": f"{port}", "OMP_NUM_THREADS": "1"},
+    }
+
+
+@pytest.mark.slow
+def test_what_the_first_process_refuses_ends_the_others_too(data, tmp_path):
+    """Only the first one sees that there is nothing to resume; then both train another run."""
+    flags = {"trainer": {**TWO, "max_steps": 2}}
+    jobs = [
+        {"run": "", "resume": str(tmp_path / "nowhere"), "sections": flags},
+        {"run": str(tmp_path / "run"), "sections": flags},
+    ]
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "tests.training.train_many", str(data), json.dumps(jobs)]
+    started = [
+        subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **slurm(rank, port)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    try:
+        printed = [process.communicate(timeout=300)[0] for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    first, second = (json.loads(each.splitlines()[-1]) for each in printed)
+    assert first[0].startswith("2: there is nothing to resume")
+    assert second[0] == "2"
+    assert (first[1], second[1]) == (None, "0")
+    assert read_metadata(RunFolder(tmp_path / "run").weights)["step"] == 2
 
 
 @pytest.mark.slow
