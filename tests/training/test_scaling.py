@@ -2,16 +2,22 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
+from acwm_core.training.fit import fit
 from acwm_core.training.layers import state_memory
+from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import RunFolder
+from tests.tiny import tiny_recipe
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
 COMMANDS = re.findall(r"(?:acwm|acwm_core\.cli) fit ([^;`\n]+)", TEXT.replace("\\\n", " "))
@@ -37,6 +43,44 @@ def gigabytes(size):
 @pytest.mark.parametrize("size", ["dit_s", "dit_m", "dit_l", "dit_xl"])
 def test_the_table_is_what_is_counted(size):
     assert f"| `{size}` | {' | '.join(gigabytes(size))} |" in TEXT
+
+
+def test_the_table_of_checkpoints_is_the_sum():
+    rows = re.findall(r"\| ([\d.]+) GB \| ([\d.]+) GB \| ([\d.]+) GB \| ([\d.]+) GB \|", TEXT)
+    assert len(rows) == 4
+    for row, size in zip(rows, ("dit_s", "dit_m", "dit_l", "dit_xl"), strict=True):
+        parameters, *_, last = gigabytes(size)
+        last, weights, written, kept = map(float, (last, *row[1:]))
+        assert row[0] == f"{last}"
+        assert weights == pytest.approx(float(parameters[:-2].replace(",", "")) * 4e-3, abs=0.06)
+        assert (written, kept) == pytest.approx((last + weights, 2 * last + weights), abs=0.16)
+
+
+def test_the_table_of_eight_gpus_is_the_sum():
+    rows = re.findall(r"^\|.*`(?:ddp|fsdp)` \| ([\d. |]+) \|$", TEXT, re.MULTILINE)
+    assert len(rows) == 5
+    for row in rows:
+        state, activations, whole, *_ = map(float, row.split(" | "))
+        assert whole == pytest.approx(state + activations)
+
+
+def test_the_average_of_checkpoints_is_a_run(data, tmp_path, monkeypatch):
+    (code,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    run, other = RunFolder(tmp_path / "runs" / "push_cube"), RunFolder(tmp_path / "other")
+    for number, each in enumerate((run, other)):
+        training = {"seed": number, "validation_rollouts": 0, "sample_every_n_steps": 0}
+        fit(tiny_recipe(data, trainer={"max_steps": 2}, training=training), each.path)
+    kept = run.path / "kept"
+    kept.mkdir()
+    for number, each in enumerate((run, other)):
+        shutil.copy(each.last_checkpoint, kept / f"{number}.ckpt")
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    one, two = (load_file(each.weights) for each in (run, other))
+    made = load_run(tmp_path / "runs" / "push_cube_averaged").world_model.state_dict()
+    assert any(not torch.equal(one[name], two[name]) for name in one)
+    for name in one:
+        torch.testing.assert_close(made[name], (one[name] + two[name]) / 2)
 
 
 def test_the_commands_compose():
