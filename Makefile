@@ -53,7 +53,7 @@ site: $(VENV)/installed-all  ## Build the site of the documents in site/
 CODEC_DATA := cloth_move:128:12 push_sand:80:12 pour_water:40:12 stack_cube:160:24 \
 	reacher:200:24 push_cube:200:24 push_rope:160:24 robot_arm:200:24
 CODEC_FOLDER ?= data/codec
-CODEC_OPTIONS ?= --steps 14000 --batch 16 --peak 8e-4
+CODEC_OPTIONS ?= --steps 16000 --batch 16 --peak 8e-4
 
 codec-weights: $(VENV)/installed-all  ## Train the codec fine anew, in hours (docs/codecs.md)
 	@set -e; for each in $(CODEC_DATA); do \
