@@ -57,14 +57,14 @@ def test_one_that_registers_what_nobody_could_use(install: Install, added: str, 
         f"""
         @hookimpl
         def register_codecs(registry):
-            registry.add("fine", "plugin_types:Codec")
+            registry.add("sound", "plugin_types:Codec")
             registry.add({added})
         """,
     )
     catalog = loaded()
     assert told in reasons(catalog)["plugin_types"]
     assert "plugin_types.py:6)" in reasons(catalog)["plugin_types"]
-    assert "fine" not in catalog.registry("codec")
+    assert "sound" not in catalog.registry("codec")
     assert unharmed(catalog)
 
 

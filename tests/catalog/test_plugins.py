@@ -24,13 +24,13 @@ def test_a_plugin_of_ones_own(install: Install) -> None:
 
         @hookimpl
         def register_codecs(registry):
-            registry.add("fine", "plugin_fine:Codec", summary="a codec", width=3)
+            registry.add("sound", "plugin_fine:Codec", summary="a codec", width=3)
         """,
     )
     catalog = loaded()
-    component = catalog.component("codec", "fine")
+    component = catalog.component("codec", "sound")
     assert (component.plugin, component.distribution) == ("plugin_fine", "plugin_fine")
-    assert catalog.create("codec", "fine", depth=2).size == (3, 2)
+    assert catalog.create("codec", "sound", depth=2).size == (3, 2)
 
 
 def test_one_that_registers_a_taken_name(install: Install) -> None:

@@ -359,8 +359,9 @@ class LooksAhead(Recurrent):
 
 @FLAWS.caught_by("streams what it predicts", "differ by")
 class ForgetsItsState(Recurrent):
-    def frame(self, state):
-        return super().frame(state) + 1
+    def next_state(self, state, conditioning):
+        latent, moved = super().next_state(state, conditioning)
+        return latent + 1, moved
 
 
 @FLAWS.caught_by("streams what it predicts", "refuses to stream")

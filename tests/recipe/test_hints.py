@@ -40,8 +40,8 @@ def test_recipes_are_listed_with_their_first_comment():
 
 def test_an_unknown_name_tells_of_plugins_that_were_left_out():
     catalog = Catalog()
-    catalog.add_plugin(plugin_of(codecs={"fine": "somewhere:Fine"}), "whole")
+    catalog.add_plugin(plugin_of(codecs={"sound": "somewhere:Sound"}), "whole")
     catalog.problems.append(Problem("acwm_broken", "No module named 'nonsuch'"))
     with pytest.raises(RecipeError, match=r"'acwm_broken' was left out: No module named"):
         catalog.component("codec", "mine")
-    assert catalog.component("codec", "fine").target == "somewhere:Fine"
+    assert catalog.component("codec", "sound").target == "somewhere:Sound"
