@@ -23,21 +23,15 @@ def register_codecs(registry: Registry) -> None:
         "acwm_codecs.compact:Compact",
         summary="small causal autoencoder with shipped weights: strides 8×8×4, 16 channels",
     )
-    registry.add(
-        "fine",
-        "acwm_codecs.compact:Fine",
-        summary="the same at half its stride, for small objects: strides 4×4×4, 16 channels",
-    )
+    fine = "the same at half its stride, for small objects: strides 4×4×4, 16 channels"
+    registry.add("fine", "acwm_codecs.compact:Fine", summary=fine)
     registry.add(
         "compact_per_frame",
         "acwm_codecs.compact_per_frame:CompactPerFrame",
         summary="the same weights with every frame by itself: strides 8×8, 16 channels",
     )
-    registry.add(
-        "identity",
-        "acwm_codecs.identity:Identity",
-        summary="lossless: folds blocks of pixels and frames into channels, nothing learned",
-    )
+    lossless = "lossless: folds blocks of pixels and frames into channels, nothing learned"
+    registry.add("identity", "acwm_codecs.identity:Identity", summary=lossless)
     registry.add(
         "wan",
         "acwm_codecs.wan:Wan",

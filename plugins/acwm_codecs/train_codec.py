@@ -288,10 +288,8 @@ def train_on(
         if step % 100 == 0 or step == steps:
             save(trained, out, {**record, "steps": step})
             training.store(state, record)
-            psnr = " ".join(
-                f"{name} {value:.1f}"
-                for name, value in zip(names, training.running.decibels(), strict=True)
-            )
+            decibels = zip(names, training.running.decibels(), strict=True)
+            psnr = " ".join(f"{name} {value:.1f}" for name, value in decibels)
             click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {psnr}")
     state.unlink(missing_ok=True)
     for folder in loaded:

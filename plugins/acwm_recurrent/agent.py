@@ -102,7 +102,8 @@ class AgentPath(nn.Module):
         assert states is not None
         read = functional.mse_loss(self.read(batch.latents.flatten(0, 1)), states.flatten(0, 1))
         noise = sent(drawn_noise(states.shape[2:], batch.generators), states)
-        agent, moved = self.begin(states[:, 0] + START_NOISE * noise), list[Tensor]()
+        agent = self.begin(states[:, 0] + START_NOISE * noise)
+        moved: list[Tensor] = []
         for frame in range(1, states.shape[1]):
             agent = self.step(agent, actions[:, frame])
             moved.append(agent.state)

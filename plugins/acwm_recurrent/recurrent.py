@@ -113,7 +113,8 @@ class RecurrentModel(Predictor):
         known = given.shape[1]
         actions = self.actions(conditioning)
         state = self.start(given, actions[:, 0])
-        grids, modulations = list[Tensor](), list[Tensor]()
+        grids: list[Tensor] = []
+        modulations: list[Tensor] = []
         for frame in range(known, frames):
             state, modulation = self.step(state, actions[:, frame])
             grids.append(state.grid)

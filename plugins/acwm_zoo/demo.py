@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER
-from acwm_core.evaluation.results import Summary
 from acwm_core.plugins import catalog
 from acwm_core.training.threads import wait_without_spinning
 from acwm_report.terminal import print_summary
@@ -86,6 +85,8 @@ def demo(out: Path | None, quick: bool) -> None:
         Step("predicting the test episodes", 40, lambda: _evaluate(run)),
         Step("writing the report", 10, both),
     )
+    from acwm_core.evaluation.results import Summary
+
     print_summary(Summary.read(run))
     click.echo(f"report: {report}")
 
