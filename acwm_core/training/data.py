@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -63,21 +64,13 @@ class ClipData(L.LightningDataModule):
         self._cached = config.cache_latents and compresses(codec) and not self._streams
 
     def _check_states(self) -> None:
-        """Refuse fields of the state that the data lacks, or whose symmetry is not known."""
-        card = self.episodes.card.environment
-        for name in self.config.states:
-            known = [field.name for field in card.state]
-            if name not in known:
+        """Refuse symmetries that do not say how they transform the states to learn."""
+        for name, symmetry in itertools.product(self.config.states, self._symmetries):
+            if name not in symmetry.states:
                 raise DataError(
-                    f"data.states: {self.episodes.path} has no state {name!r}, but "
-                    f"{', '.join(known) or 'none at all'}"
+                    f"data.states: the symmetry {symmetry.name} of {self.episodes.path} does not "
+                    f"say how it transforms {name}: leave out {name}, or data.symmetries"
                 )
-            for symmetry in self._symmetries:
-                if name not in symmetry.states:
-                    raise DataError(
-                        f"data.states: the symmetry {symmetry.name} of {card.name} does not say "
-                        f"how it transforms {name}: leave out {name}, or data.symmetries"
-                    )
 
     def state_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the states to learn, `[S]` each, over training episodes.

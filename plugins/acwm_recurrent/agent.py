@@ -41,7 +41,10 @@ class AgentPath(nn.Module):
     Args:
         latent_channels: channels C of the latent.
         state_size: number of values S of the state.
-        width: size of the embedded actions, and of what `embed` gives.
+        width: size of the embedded actions, and of the modulation.
+
+    Attributes:
+        embed: maps states `[…, S]` to a modulation `[…, width]`.
     """
 
     def __init__(self, latent_channels: int, state_size: int, width: int) -> None:
@@ -61,9 +64,7 @@ class AgentPath(nn.Module):
         self.start_hidden = nn.Linear(state_size, HIDDEN)
         self.gru = nn.GRUCell(width + state_size, HIDDEN)
         self.change = nn.Linear(HIDDEN, state_size)
-        self.embedding = nn.Sequential(
-            nn.Linear(state_size, width), nn.SiLU(), nn.Linear(width, width)
-        )
+        self.embed = nn.Sequential(nn.Linear(state_size, width), nn.SiLU(), nn.Linear(width, width))
 
     def start(self, frame: Tensor) -> Agent:
         """The agent in a latent frame `[B, C, h, w]`."""
@@ -86,10 +87,6 @@ class AgentPath(nn.Module):
             driven = torch.cat([action.to(agent.state), agent.state], -1)
             hidden = self.gru(driven, agent.hidden)
             return Agent(agent.state + self.change(hidden), hidden)
-
-    def embed(self, state: Tensor) -> Tensor:
-        """States `[…, S]` as a modulation `[…, width]`."""
-        return self.embedding(state)
 
     def loss(self, batch: Batch, actions: Tensor) -> Tensor:
         """Squared errors of the state that is read from frames, and of that moved from a true one.

@@ -58,7 +58,7 @@ def test_states_teach_the_agent_and_the_picture_does_not_bend_it():
     learnt = [*world.model.agent.look.parameters(), *world.model.agent.gru.parameters()]
     world.loss(latents, moves).backward()
     assert all(each.grad is None for each in learnt)
-    assert world.model.agent.embedding[0].weight.grad.abs().sum() > 0
+    assert world.model.agent.embed[0].weight.grad.abs().sum() > 0
     world.loss(latents, moves, states=states).backward()
     assert all(each.grad is not None for each in learnt)
 
