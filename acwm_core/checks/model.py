@@ -25,6 +25,7 @@ from acwm_core.checks.trial import (
     Probe,
     batch_error,
     batch_of,
+    draws,
     further_inputs,
     noise,
     probed,
@@ -191,6 +192,24 @@ class DynamicsChecks(PredictionTrial):
             error = batch_error(predicted, streamed)
             what = f"after {known} given frames a stream and a prediction differ by {error:.2g}"
             expect(error < 1e-3 or self.is_denoiser, what)
+
+    @torch.no_grad()
+    def returns_only_the_frames_asked_for(self) -> None:
+        """With `skips` true, return with `only` the same frames as without."""
+        if not (isinstance(self._model, Predictor) and self._model.skips):
+            raise NotTried("it returns all frames")
+        latents, modulation = self._inputs()
+        batch, frames = SHAPE[:2]
+        only = torch.arange(batch)[:, None] % (frames - 1)
+        clip = latents[:, :1], probed(modulation), frames
+        whole = self._model(*clip, **self._drawing(batch))
+        some = self._model(*clip, **self._drawing(batch), only=only)
+        error = batch_error(whole.take_along_dim(only[..., None, None, None], 1), some)
+        expect(error < 1e-3, f"with only it returns frames that differ by {error:.2g}")
+
+    def _drawing(self, batch: int) -> dict[str, Any]:
+        """The further argument of a predictor that draws."""
+        return {"generators": draws(batch)} if self._model.samples else {}
 
 
 class DenoiserChecks(Suite):

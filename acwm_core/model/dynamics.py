@@ -147,11 +147,17 @@ class Predictor(DynamicsModel):
     One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
     which the framework fills in, and implements `state_loss`.
 
+    One that saves work if it need not return all frames (`skips`) takes the further keyword
+    ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
+    return, counted from the first predicted one.
+
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
+        skips: whether `forward` takes ``only``.
     """
 
     streams: bool = False
+    skips: bool = False
 
     @abstractmethod
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:

@@ -16,6 +16,9 @@ CELLS = 4
 HIDDEN = 160
 """Size of the hidden state that the actions move."""
 
+READ_FRAMES = 4
+"""Frames of each clip from which it learns to read the state, as those of a clip are much alike."""
+
 START_NOISE = 0.05
 """Noise on the true states that its motion is learned from, in standard deviations of the state."""
 
@@ -97,7 +100,10 @@ class AgentPath(nn.Module):
         """
         states = batch.states
         assert states is not None
-        read = functional.mse_loss(self.read(batch.latents.flatten(0, 1)), states.flatten(0, 1))
+        picked = batch.picked(READ_FRAMES, states.shape[1])
+        frames = batch.latents.take_along_dim(picked[..., None, None, None], 1)
+        true = states.take_along_dim(picked[..., None], 1)
+        read = functional.mse_loss(self.read(frames.flatten(0, 1)), true.flatten(0, 1))
         noise = sent(drawn_noise(states.shape[2:], batch.generators), states)
         agent = self.begin(states[:, 0] + START_NOISE * noise)
         moved: list[Tensor] = []

@@ -68,7 +68,7 @@ class RecurrentModel(Predictor):
     """
 
     layers, heads = 0, 1
-    causal = streams = True
+    causal = streams = skips = True
 
     def __init__(
         self,
@@ -108,8 +108,18 @@ class RecurrentModel(Predictor):
             nn.init.zeros_(parameter)
         self.agent = AgentPath(latent_channels, state_size, width) if state_size else None
 
-    def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
-        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`."""
+    def forward(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        *,
+        only: Tensor | None = None,
+    ) -> Latent:
+        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
+
+        All are unrolled, and with `only` none but those `[B, N]` is read.
+        """
         known = given.shape[1]
         actions = self.actions(conditioning)
         state = self.start(given, actions[:, 0])
@@ -119,7 +129,7 @@ class RecurrentModel(Predictor):
             state, modulation = self.step(state, actions[:, frame])
             grids.append(state.grid)
             modulations.append(modulation)
-        grid, modulation = (torch.stack(each, 1).flatten(0, 1) for each in (grids, modulations))
+        grid, modulation = (_picked(each, only).flatten(0, 1) for each in (grids, modulations))
         changes = self._read(grid, modulation).unflatten(0, (len(given), -1))
         return state.base[:, None] + changes
 
@@ -240,6 +250,14 @@ class _RecurrentStream(LatentStream):
             self._state = self._model.initial_state(self._given, conditioning)
         latent, self._state = self._model.next_state(self._state, conditioning)
         return latent
+
+
+def _picked(frames: list[Tensor], only: Tensor | None) -> Tensor:
+    """Values of the frames, each `[B, …]`, side by side; with `only`, of those `[B, N]`."""
+    stacked = torch.stack(frames, 1)
+    if only is None:
+        return stacked
+    return stacked[torch.arange(len(only), device=only.device)[:, None], only]
 
 
 def _tensors(state: State) -> tuple[Tensor, ...]:

@@ -164,6 +164,18 @@ def test_a_stream_must_keep_the_draw():
     assert "its stream ignores generators" in found["draws from the generators if it says so"]
 
 
+def test_a_predictor_that_skips_returns_the_frames_asked_for():
+    class Skips(TinyPredictor):
+        skips = True
+
+        def forward(self, given, conditioning, frames, *, only=None):
+            whole = super().forward(given, conditioning, frames)
+            return whole if only is None else whole[:, : only.shape[1]]
+
+    found = failures(check_model(latent_channels(Skips)))
+    assert "with only it returns frames" in found["returns only the frames asked for"]
+
+
 class _Between(Probe):
     """Stands between a model and the conditioner, and does what it is told with some calls.
 

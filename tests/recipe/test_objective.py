@@ -36,7 +36,7 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
         ["+next_frame", "+recurrent"],
         ["+recurrent", "+small", "+next_frame"],  # whose objectives follow the model
     ):
-        assert objective(*words) == ("regression", {"state_weight": 0.3})
+        assert objective(*words) == ("regression", {"state_weight": 0.3, "frames": None})
     assert objective("+recurrent", "model=dit_xs") == ("diffusion_forcing", SMALL)
 
 
@@ -46,7 +46,7 @@ def test_an_objective_chosen_with_the_model_or_later_stays(tmp_path):
     mine.write_text("extends: push_cube_small\nmodel: recurrent\nobjective: next_frame\n")
     assert objective(recipe=mine)[0] == "next_frame"
     mine.write_text("extends: push_cube_small\nmodel: recurrent\n")
-    assert objective(recipe=mine) == ("regression", {"state_weight": 0.3})
+    assert objective(recipe=mine) == ("regression", {"state_weight": 0.3, "frames": None})
 
 
 def test_a_saved_recipe_says_what_was_used(tmp_path):

@@ -2,11 +2,13 @@
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
+from acwm_core.checks.trial import WIDTH, TinyPredictor
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Predictor
@@ -166,6 +168,37 @@ def test_it_learns_to_move_what_actions_move():
     still = (latents[:, 1:] - latents[:, :1]).square().mean().item()
     assert error < 0.5 * still
     assert error < 0.5 * shuffled
+
+
+def test_frames_that_are_drawn_have_the_loss_of_all_on_average():
+    torch.manual_seed(0)
+    model = RecurrentModel(latent_channels=2, blocks=1, reading_blocks=1, channels=8, width=16)
+    for parameter in model.parameters():
+        nn.init.normal_(parameter, std=0.2)
+    latents, modulation = torch.randn(4, 6, 2, 8, 8), torch.randn(4, 6, 16)
+
+    def loss(frames, seed):
+        generators = [torch.Generator().manual_seed(4 * seed + clip) for clip in range(4)]
+        batch = Batch(latents, Conditioning(modulation, None, None), generators)
+        with torch.no_grad():
+            return Regression(frames=frames).loss(model, batch, 1).item()
+
+    drawn = [loss(2, seed) for seed in range(200)]
+    assert np.mean(drawn) == pytest.approx(loss(None, 0), rel=0.02)
+    assert len({*drawn}) > 100
+    assert loss(2, 7) == drawn[7]
+    assert loss(9, 0) == pytest.approx(loss(None, 0), rel=1e-5)
+    model.eval()
+    assert loss(2, 0) == loss(None, 0)
+
+
+def test_a_model_that_returns_all_frames_refuses_to_draw_some():
+    latents, modulation = torch.zeros(1, 3, 2, 8, 8), torch.zeros(1, 3, WIDTH)
+    batch = Batch(latents, Conditioning(modulation, None, None), [torch.Generator()])
+    with pytest.raises(RecipeError, match=r"TinyPredictor .* leave out objective.frames"):
+        Regression(frames=2).loss(TinyPredictor(2), batch, 1)
+    with pytest.raises(RecipeError, match="at least 1"):
+        Regression(frames=0)
 
 
 def test_muon_gets_the_convolutions_and_no_other_parameter_is_left_out(world):

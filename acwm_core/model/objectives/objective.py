@@ -39,6 +39,14 @@ class Batch:
         """Standard normal noise `[B, frames, C, h, w]`, of the latents' type and device."""
         return sent(drawn_noise((frames, *self.latents.shape[2:]), self.generators), self.latents)
 
+    def picked(self, frames: int, among: int) -> Tensor:
+        """Numbers of so many frames of each clip, drawn at random from the first `among`.
+
+        `[B, N]`, with N = `frames`, or `among` if that is fewer.
+        """
+        orders = [torch.randperm(among, generator=each) for each in self.generators]
+        return sent(torch.stack(orders)[:, :frames], self.latents, torch.int64)
+
 
 def drawn_noise(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
     """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""

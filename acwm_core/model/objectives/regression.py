@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from acwm_core.errors import check_shape
+from acwm_core.errors import RecipeError, check_shape
 from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Latent
@@ -23,18 +23,31 @@ class Regression(Objective[Predictor]):
 
     Args:
         state_weight: weight of the model's loss of the agent's states, if it learns some.
+        frames: number of latent frames of each clip, drawn at random, that a training step
+            compares; None for all. Frames of a clip are much alike: where a model saves the work
+            for the others, more clips in the same time teach it more.
+
+    Raises:
+        RecipeError: no frames, or a model that saves no work (`Predictor.skips`).
     """
 
     trains = Predictor
     learns_states = True
 
-    def __init__(self, *, state_weight: float = 0.3) -> None:
+    def __init__(self, *, state_weight: float = 0.3, frames: int | None = None) -> None:
+        if frames is not None and frames < 1:
+            raise RecipeError(f"objective.frames is {frames}; it must be at least 1")
         self.state_weight = state_weight
+        self.frames = frames
 
     def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
         given, true = batch.latents[:, :known], batch.latents[:, known:]
-        predicted = _predicted(model, replace(batch, latents=given), batch.latents.shape[1])
+        only = self._drawn(model, batch, true.shape[1])
+        if only is not None:
+            true = true.take_along_dim(only[..., None, None, None], 1)
+        beginning = replace(batch, latents=given)
+        predicted = _predicted(model, beginning, batch.latents.shape[1], only)
         loss = functional.mse_loss(predicted.float(), true.float())
         return loss if batch.states is None else loss + self.state_weight * model.state_loss(batch)
 
@@ -61,12 +74,26 @@ class Regression(Objective[Predictor]):
         """Whether the model has a stream: it was trained to carry its state over the clip."""
         return model.streams
 
+    def _drawn(self, model: Predictor, batch: Batch, predicted: int) -> Tensor | None:
+        """The frames of each clip to compare, `[B, N]`; None for all, as in validation."""
+        if self.frames is None:
+            return None
+        if not model.skips:
+            raise RecipeError(
+                f"{type(model).__name__} predicts all frames of a clip or none: leave out "
+                "objective.frames"
+            )
+        return batch.picked(self.frames, predicted) if model.training else None
 
-def _predicted(model: Predictor, given: Batch, frames: int) -> Latent:
+
+def _predicted(model: Predictor, given: Batch, frames: int, only: Tensor | None = None) -> Latent:
     batch, known, *size = given.latents.shape
-    drawing = _drawing(model, given.generators)
-    made = model(given.latents, given.conditioning, frames, **drawing)
-    check_shape(model, "forward", made, batch, frames - known, *size)
+    further = _drawing(model, given.generators)
+    if only is not None:
+        further["only"] = only
+    made = model(given.latents, given.conditioning, frames, **further)
+    number = frames - known if only is None else only.shape[1]
+    check_shape(model, "forward", made, batch, number, *size)
     return made
 
 
