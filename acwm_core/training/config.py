@@ -79,6 +79,8 @@ class TrainingConfig:
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
             default weights are initialised randomly.
+        ignore_mismatched_sizes: with `init_from`, take the weights that fit by name and shape, even
+            if they were trained on latents of another codec, and initialise the others randomly.
         seed: seed of initial weights, clip order and noise.
         compile: compile the model with `torch.compile`; pays off after minutes.
         activation_checkpointing: keep only the inputs of each layer and recompute its activations
@@ -106,6 +108,7 @@ class TrainingConfig:
     random_starts: float = 0.0
     ema_decay: float = 0.999
     init_from: str | None = None
+    ignore_mismatched_sizes: bool = False
     seed: int = 0
     compile: bool = False
     activation_checkpointing: bool = False
@@ -131,6 +134,11 @@ class TrainingConfig:
             ("growing_horizon", 0 <= self.growing_horizon <= 1, "must lie in [0, 1]"),
             ("random_starts", 0 <= self.random_starts <= 1, "must lie in [0, 1]"),
             ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
+            (
+                "ignore_mismatched_sizes",
+                self.init_from is not None or not self.ignore_mismatched_sizes,
+                "goes with training.init_from=RUN, whose weights it is about",
+            ),
             ("seed", self.seed >= 0, "must not be negative"),
             ("cpu_threads", threads is None or threads >= 1, "must be at least 1"),
             ("validate_every_n_steps", self.validate_every_n_steps >= 1, "must be at least 1"),

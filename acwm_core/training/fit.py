@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from acwm_core.data.clips import DataConfig
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.env.environment import resolve_size
-from acwm_core.errors import AcwmError, TrainingError
+from acwm_core.errors import AcwmError, AcwmWarning, TrainingError
 from acwm_core.model.build import build_world_model
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, recipe_differences
@@ -37,7 +38,7 @@ from acwm_core.training.resume import (
     described,
     is_first_process,
 )
-from acwm_core.training.run import all_training, load_weights
+from acwm_core.training.run import all_training, load_fitting_weights, load_weights
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
 from acwm_core.training.threads import use_threads
@@ -107,7 +108,7 @@ def _train(
     world_model = build_world_model(recipe, episodes.card.environment)
     start = None
     if config.init_from and checkpoint is None:
-        start = _start_from(config.init_from, world_model, recipe)
+        start = _start_from(config.init_from, world_model, recipe, config.ignore_mismatched_sizes)
     clips = DataConfig(**recipe.data)
     kind = GrowingClipData if clips.growing else ClipData
     data = kind(clips, episodes, world_model.codec, config.seed)
@@ -133,17 +134,26 @@ def _train(
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
 
 
-def _start_from(name: str, world_model: WorldModel, recipe: Recipe) -> dict[str, Any]:
+def _start_from(
+    name: str, world_model: WorldModel, recipe: Recipe, ignore_mismatched: bool
+) -> dict[str, Any]:
     """Load the weights of another run; returns what `all_training` knows of them."""
     initial = RunFolder(find_run(name))
     if not initial.weights.is_file():
         raise TrainingError(f"training.init_from={name}: there is no run with trained weights")
+    if ignore_mismatched:
+        others = load_fitting_weights(world_model, initial.weights)
+        if others:
+            message = f"initialised randomly, as {name} has none that fit: {', '.join(others)}"
+            warnings.warn(message, AcwmWarning, stacklevel=2)
+        return all_training(name, initial)
     try:
         load_weights(world_model, initial.weights)
     except TrainingError as error:
         others = recipe_differences(Recipe.from_yaml(initial.recipe), recipe)
         of_the_model = [each for each in others if each.startswith("model.")]
-        raise TrainingError("; ".join([str(error), *of_the_model])) from error
+        anyway = "training.ignore_mismatched_sizes=true takes what fits"
+        raise TrainingError("; ".join([str(error), *of_the_model, anyway])) from error
     return all_training(name, initial)
 
 

@@ -124,14 +124,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
             f"{world_model.codec.fingerprint()}): restore that codec or train again"
         )
-    weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
-    if facts.get("sha256") not in (None, digest(weights)):  # None in old files
-        raise TrainingError(
-            f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
-            "or have training write it again with resume=auto"
-        )
-    check_finite(path, weights)
-    expected = {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
+    weights, expected = _stored(path, facts), _trained(world_model)
     for name in sorted({*weights, *expected}):
         found = tuple(weights[name].shape) if name in weights else "missing"
         wanted = tuple(expected[name].shape) if name in expected else "absent"
@@ -139,9 +132,52 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             raise TrainingError(
                 f"{path} does not fit the recipe: {name} is {found}, the model wants it {wanted}"
             )
-    with torch.no_grad():
-        for name, value in expected.items():
-            value.copy_(weights[name])
+    _take(expected, weights)
+
+
+def load_fitting_weights(world_model: WorldModel, path: Path) -> list[str]:
+    """Load those weights that fit by name and shape, of whatever codec's latents.
+
+    Returns:
+        The names of the model's other weights, which stay as they are.
+
+    Raises:
+        TrainingError: the file is damaged, or not one of its weights fits.
+        DataError: its weights are not finite.
+    """
+    weights, expected = _stored(path, read_metadata(path)), _trained(world_model)
+    fitting = {
+        name: value
+        for name, value in expected.items()
+        if name in weights and weights[name].shape == value.shape
+    }
+    if not fitting:
+        raise TrainingError(f"not one weight of {path} fits the recipe's model by name and shape")
+    _take(fitting, weights)
+    return sorted({*expected} - {*fitting})
+
+
+def _stored(path: Path, facts: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The finite weights of an undamaged file with this metadata."""
+    weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
+    if facts.get("sha256") not in (None, digest(weights)):  # None in old files
+        raise TrainingError(
+            f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
+            "or have training write it again with resume=auto"
+        )
+    check_finite(path, weights)
+    return weights
+
+
+def _trained(world_model: WorldModel) -> dict[str, Tensor]:
+    """All but the codec's weights."""
+    return {k: v for k, v in world_model.state_dict().items() if k.startswith(TRAINED)}
+
+
+@torch.no_grad()
+def _take(expected: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> None:
+    for name, value in expected.items():
+        value.copy_(weights[name])
 
 
 def training_of(run: RunFolder) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from acwm_core.errors import TrainingError
+from acwm_core.errors import AcwmWarning, TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder
@@ -50,7 +50,8 @@ def test_a_resumed_run_no_longer_needs_the_other(first, data, tmp_path, monkeypa
 def test_weights_that_do_not_fit_are_refused(first, data, tmp_path):
     changes = {**started_from(first), "model": {"width": 6}}
     with pytest.raises(
-        TrainingError, match=r"does not fit the recipe: .*embed.*; model.width was 8, is 6$"
+        TrainingError,
+        match=r"does not fit the recipe: .*embed.*; model.width was 8, is 6; .*ignore_mismatched_sizes=true",
     ):
         fit(tiny_recipe(data, **changes), tmp_path / "run")
     with pytest.raises(TrainingError, match="another codec"):
@@ -58,3 +59,26 @@ def test_weights_that_do_not_fit_are_refused(first, data, tmp_path):
     with pytest.raises(TrainingError, match="nowhere: there is no run with trained weights"):
         fit(tiny_recipe(data, **started_from(tmp_path / "nowhere")), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_weights_that_fit_are_taken_if_the_others_may_be_new(first, data, tmp_path):
+    sections = {
+        "training": {
+            **started_from(first, learning_rate=1e-12, warmup_steps=0)["training"],
+            "ignore_mismatched_sizes": True,
+        },
+        "codec": {"gain": 3.0},
+    }
+    same = fit(tiny_recipe(data, trainer={"max_steps": 1}, **sections), tmp_path / "same")
+    for name, tensor in state(first).items():
+        torch.testing.assert_close(state(same)[name], tensor, rtol=0, atol=1e-7)
+    sections["model"] = {"width": 6}
+    with pytest.warns(AcwmWarning, match="initialised randomly, as .* has none that fit") as told:
+        other = fit(tiny_recipe(data, trainer={"max_steps": 1}, **sections), tmp_path / "other")
+    before, after = state(first), state(other)
+    fitting = {name for name in after if before[name].shape == after[name].shape}
+    assert 0 < len(fitting) < len(after)
+    for name in fitting:
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-7)
+    message = next(str(each.message) for each in told if "has none that fit" in str(each.message))
+    assert all(name in message for name in {*after} - fitting)
