@@ -51,7 +51,7 @@ def test_weights_that_do_not_fit_are_refused(first, data, tmp_path):
     changes = {**started_from(first), "model": {"width": 6}}
     with pytest.raises(
         TrainingError,
-        match="embed.*; model.width was 8, is 6; .*ignore_mismatched_sizes=true",
+        match=r"embed.*; model.width was 8, is 6; .*ignore_mismatched_sizes=true",
     ):
         fit(tiny_recipe(data, **changes), tmp_path / "run")
     with pytest.raises(TrainingError, match="another codec"):
