@@ -13,6 +13,7 @@ from acwm_core.checks.trial import (
     WIDTH,
     PredictionTrial,
     TinyDenoiser,
+    TinyDrawer,
     TinyPredictor,
     batch_error,
     batch_of,
@@ -49,7 +50,7 @@ class ObjectiveChecks(PredictionTrial):
         cast(Any, torch).manual_seed(0)
         if issubclass(self._objective.trains, Denoiser):
             return TinyDenoiser(CHANNELS, self._objective.inputs)
-        return TinyPredictor(CHANNELS)
+        return (TinyDrawer if self._objective.draws else TinyPredictor)(CHANNELS)
 
     def _inputs(self, batch: int = BATCH, seed: int = 1) -> tuple[Latent, Tensor]:
         modulation = noise((batch, FRAMES, WIDTH), seed)  # of the actions
@@ -83,6 +84,7 @@ class ObjectiveChecks(PredictionTrial):
         plain = TinyDenoiser(CHANNELS, {})
         others: list[DynamicsModel] = [TinyPredictor(CHANNELS) if denoises else plain]
         others += [plain] if self._objective.inputs else []
+        others += [TinyPredictor(CHANNELS)] if self._objective.draws else []
         for other in others:
             try:
                 self._objective.check_model(other)

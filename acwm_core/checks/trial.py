@@ -27,7 +27,7 @@ from acwm_core.model.dynamics import (
 )
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.flow import evaluation
-from acwm_core.model.objectives.objective import Batch, Objective
+from acwm_core.model.objectives.objective import Batch, Objective, drawn_noise
 from acwm_core.model.shapes import Actions, Latent, Sigmas, Tokens, Video
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -368,6 +368,35 @@ class TinyPredictor(Predictor):
 
     def stream(self, given: Latent, *, context: int) -> LatentStream:
         return _Moved(self.move, given[:, -1:])
+
+
+class TinyDrawer(TinyPredictor):
+    """Adds noise of a learnt size to all frames, the same in each."""
+
+    samples = True
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels)
+        self.size = nn.Parameter(torch.ones(()))
+
+    def forward(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        *,
+        generators: Sequence[torch.Generator] = (),
+    ) -> Latent:
+        return super().forward(given, conditioning, frames) + self.draw(given, generators)
+
+    def stream(
+        self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()
+    ) -> LatentStream:
+        return super().stream(given + self.draw(given, generators), context=context)
+
+    def draw(self, given: Latent, generators: Sequence[torch.Generator]) -> Latent:
+        """What is added, `[B, 1, C, h, w]`."""
+        return self.size * drawn_noise((1, *given.shape[2:]), generators)
 
 
 class _Moved(LatentStream):

@@ -1,4 +1,4 @@
-"""Registers the recurrent dynamics model."""
+"""Registers the recurrent dynamics model, and the objective by which it learns to draw."""
 
 from acwm_core.plugins import Registry, hookimpl
 
@@ -11,4 +11,14 @@ def register_models(registry: Registry) -> None:
         "acwm_recurrent.recurrent:RecurrentModel",
         summary="1 M parameters: predicts the next latent frame at once, without noise",
         objective="regression",
+    )
+
+
+@hookimpl
+def register_objectives(registry: Registry) -> None:
+    """Register the objective for models that draw a future."""
+    registry.add(
+        "energy_score",
+        "acwm_recurrent.energy_score:EnergyScore",
+        summary="two draws per clip, as near to the truth and as different as true futures",
     )

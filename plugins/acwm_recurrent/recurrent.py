@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -11,7 +12,7 @@ from torch.nn import functional
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
-from acwm_core.model.objectives.objective import Batch
+from acwm_core.model.objectives.objective import Batch, drawn_noise, sent
 from acwm_core.model.shapes import Latent
 from acwm_recurrent.agent import Agent, AgentPath
 from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
@@ -27,12 +28,14 @@ class State(NamedTuple):
         grid: features of each place, `[B, channels, h, w]`.
         vector: features of the whole scene, `[B, width]`.
         base: the given latent frame that predictions are relative to, `[B, C, h, w]`.
+        draw: which of the possible futures it is, `[B, noise]`; empty if there is one only.
         agent: what is known of the agent, `[B, S]` and `[B, hidden]`; empty without states.
     """
 
     grid: Tensor
     vector: Tensor
     base: Tensor
+    draw: tuple[Tensor, ...] = ()
     agent: tuple[Tensor, ...] = ()
 
 
@@ -51,6 +54,10 @@ class RecurrentModel(Predictor):
     With the agent's states to learn from (`data.states`), it also knows the agent by its state
     alone, see `AgentPath`, and both kinds of block are told.
 
+    With `noise` it draws one of several futures: standard normal numbers, drawn once per rollout,
+    are told to all blocks in every frame (arXiv 2506.10772). What makes different draws differ as
+    much as true futures do is the objective, `energy_score`.
+
     With several given frames it starts from the last one and from the change just before it, which
     shows velocities.
 
@@ -62,6 +69,7 @@ class RecurrentModel(Predictor):
         blocks: number of residual blocks per step.
         reading_blocks: number of residual blocks that read a frame from the grid.
         patch_size: side of a patch in latent pixels.
+        noise: numbers that a draw depends on; 0 for a model that predicts one future.
 
     Raises:
         RecipeError: a size below 1, or a model without blocks.
@@ -80,12 +88,13 @@ class RecurrentModel(Predictor):
         blocks: int = 2,
         reading_blocks: int = 0,
         patch_size: int = 1,
+        noise: int = 0,
     ) -> None:
         super().__init__()
-        if min(channels, width, patch_size) < 1 or min(blocks, reading_blocks) < 0:
+        if min(channels, width, patch_size) < 1 or min(blocks, reading_blocks, noise) < 0:
             raise RecipeError(
                 "channels, width and patch_size of a recurrent model must be at least 1, and its "
-                "numbers of blocks at least 0"
+                "numbers of blocks and of noise at least 0"
             )
         if not blocks + reading_blocks:
             raise RecipeError("a recurrent model needs blocks, or reading_blocks")
@@ -107,6 +116,12 @@ class RecurrentModel(Predictor):
         for parameter in self.out.parameters():
             nn.init.zeros_(parameter)
         self.agent = AgentPath(latent_channels, state_size, width) if state_size else None
+        self.noise, self.samples = noise, noise > 0
+        self.future = (
+            nn.Sequential(nn.Linear(noise, width), nn.SiLU(), nn.Linear(width, width))
+            if noise
+            else None
+        )
 
     def forward(
         self,
@@ -115,6 +130,7 @@ class RecurrentModel(Predictor):
         frames: int,
         *,
         only: Tensor | None = None,
+        generators: Sequence[torch.Generator] = (),
     ) -> Latent:
         """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
 
@@ -122,7 +138,7 @@ class RecurrentModel(Predictor):
         """
         known = given.shape[1]
         actions = self.actions(conditioning)
-        state = self.start(given, actions[:, 0])
+        state = self.start(given, actions[:, 0], self._draw(given, generators))
         grids: list[Tensor] = []
         modulations: list[Tensor] = []
         for frame in range(known, frames):
@@ -138,21 +154,30 @@ class RecurrentModel(Predictor):
         assert self.agent is not None
         return self.agent.loss(batch, self.actions(batch.conditioning))
 
-    def stream(self, given: Latent, *, context: int) -> LatentStream:
+    def stream(
+        self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()
+    ) -> LatentStream:
         """Stream from the state. `context` is ignored, as the state holds all that is known."""
-        return _RecurrentStream(self, given)
+        return _RecurrentStream(self, given, self._draw(given, generators))
 
     def matrices(self) -> list[nn.Parameter]:
         """The weights of the convolutions in the blocks and in the head."""
         convolutions = [m for m in self.modules() if isinstance(m, MatrixConv)]
         return [c.weight for c in convolutions if c.weight.requires_grad]
 
-    def start(self, given: Latent, first: Tensor) -> State:
+    def _draw(self, given: Latent, generators: Sequence[torch.Generator]) -> tuple[Tensor, ...]:
+        """A draw of one of the futures, `[B, noise]`."""
+        if not self.noise:
+            return ()
+        return (sent(drawn_noise((self.noise,), generators), given),)
+
+    def start(self, given: Latent, first: Tensor, draw: tuple[Tensor, ...] = ()) -> State:
         """The state after the last of the given frames `[B, K, C, h, w]`.
 
         Args:
             given: latents of the given frames.
             first: the conditioner's output for a frame that no action leads to, `[B, width]`.
+            draw: see `State`.
         """
         shape = list(given.shape)
         if given.ndim != 5 or shape[2] != self.latent_channels:
@@ -173,7 +198,7 @@ class RecurrentModel(Predictor):
         pooled = functional.adaptive_avg_pool2d(grid, START_CELLS).flatten(1)
         vector = torch.tanh(self.start_vector(pooled) + first)
         agent = self.agent.start(base) if self.agent else ()
-        return State(self.start_block(grid, vector), vector, base, agent)
+        return State(self.start_block(grid, vector), vector, base, draw, tuple(agent))
 
     def step(self, state: State, action: Tensor) -> tuple[State, Tensor]:
         """The state one latent frame later, and the modulation `[B, width]` that reads it.
@@ -182,6 +207,8 @@ class RecurrentModel(Predictor):
             state: state of the previous frame.
             action: the embedded actions that lead to the next frame, `[B, width]`.
         """
+        if self.future:
+            action = action + self.future(*state.draw)
         agent = state.agent
         if self.agent:
             # Only true states teach it: the picture's error must not bend what is known of it.
@@ -193,21 +220,24 @@ class RecurrentModel(Predictor):
         grid = state.grid
         for block in self.blocks:
             grid = block(grid, vector + action)
-        return State(grid, vector, state.base, agent), vector + action
+        return State(grid, vector, state.base, state.draw, tuple(agent)), vector + action
 
-    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
+    def initial_state(
+        self, given: Latent, conditioning: Conditioning, draw: tuple[Tensor, ...] = ()
+    ) -> tuple[Tensor, ...]:
         """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors.
 
         `conditioning` starts at the first latent frame, and may be longer.
         """
-        return _tensors(self.start(given, self.actions(conditioning)[:, 0]))
+        return _tensors(self.start(given, self.actions(conditioning)[:, 0], draw))
 
     def next_state(
         self, state: tuple[Tensor, ...], conditioning: Conditioning
     ) -> tuple[Latent, tuple[Tensor, ...]]:
         """The next latent frame `[B, 1, C, h, w]` and its state, given the last conditioning."""
-        grid, vector, base, *agent = state
-        before = State(grid, vector, base, tuple(agent))
+        grid, vector, base, *rest = state
+        drawn = 1 if self.noise else 0
+        before = State(grid, vector, base, tuple(rest[:drawn]), tuple(rest[drawn:]))
         moved, modulation = self.step(before, self.actions(conditioning)[:, -1])
         frame = base + self._read(moved.grid, modulation).to(base)
         return frame[:, None], _tensors(moved)
@@ -239,15 +269,16 @@ class RecurrentModel(Predictor):
 class _RecurrentStream(LatentStream):
     """A stream that carries the state of a recurrent model."""
 
-    def __init__(self, model: RecurrentModel, given: Latent) -> None:
+    def __init__(self, model: RecurrentModel, given: Latent, draw: tuple[Tensor, ...]) -> None:
         self._model = model
         self._given = given
+        self._draw = draw
         self._state: tuple[Tensor, ...] | None = None
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
         if self._state is None:
-            self._state = self._model.initial_state(self._given, conditioning)
+            self._state = self._model.initial_state(self._given, conditioning, self._draw)
         latent, self._state = self._model.next_state(self._state, conditioning)
         return latent
 
@@ -261,7 +292,7 @@ def _picked(frames: list[Tensor], only: Tensor | None) -> Tensor:
 
 
 def _tensors(state: State) -> tuple[Tensor, ...]:
-    return (*state[:3], *state.agent)
+    return (*state[:3], *state.draw, *state.agent)
 
 
 def _coordinates(cells: Tensor) -> Tensor:

@@ -11,11 +11,10 @@ from torch import nn
 from acwm_core.checks import check_model
 from acwm_core.checks.model import DenoiserChecks, DynamicsChecks, Probe
 from acwm_core.checks.result import checks_of
-from acwm_core.checks.trial import TinyPredictor
+from acwm_core.checks.trial import TinyDrawer, TinyPredictor
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import DynamicsModel, Predictor
 from acwm_core.model.objectives.next_frame import NextFrame
-from acwm_core.model.objectives.objective import drawn_noise
 from acwm_dit.dit import DiT
 from acwm_recurrent.recurrent import RecurrentModel
 from tests.checks.results import Flaws, failures, installed
@@ -115,21 +114,6 @@ class SaysThatItIsCertain(Flawed):
     samples = False
 
 
-class Drawing(TinyPredictor):
-    """A predictor that draws a future and stays with it, in a clip as in a stream."""
-
-    samples = True
-
-    def forward(self, given, conditioning, frames, *, generators):
-        return super().forward(given, conditioning, frames) + self.draw(given, generators)
-
-    def stream(self, given, *, context, generators):
-        return super().stream(given + self.draw(given, generators), context=context)
-
-    def draw(self, given, generators):
-        return drawn_noise((1, *given.shape[2:]), generators)
-
-
 def latent_channels(drawing):
     """The class as a recipe builds it."""
     return lambda *, latent_channels: drawing(latent_channels)
@@ -137,7 +121,7 @@ def latent_channels(drawing):
 
 def test_a_predictor_that_draws_conforms():
     check = "draws from the generators if it says so"
-    results = {result.name: result for result in check_model(latent_channels(Drawing))}
+    results = {result.name: result for result in check_model(latent_channels(TinyDrawer))}
     assert results[check].passed
     assert not results[check].reason  # it was tried
 
@@ -150,13 +134,13 @@ def test_a_predictor_that_draws_conforms():
     ],
 )
 def test_a_predictor_must_draw_from_the_generators(draw, reason):
-    flawed = latent_channels(type("Undrawn", (Drawing,), {"draw": draw}))
+    flawed = latent_channels(type("Undrawn", (TinyDrawer,), {"draw": draw}))
     found = failures(check_model(flawed))
     assert reason in found["draws from the generators if it says so"]
 
 
 def test_a_stream_must_keep_the_draw():
-    class Forgets(Drawing):
+    class Forgets(TinyDrawer):
         def stream(self, given, *, context, generators):
             return TinyPredictor.stream(self, given, context=context)
 

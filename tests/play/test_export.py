@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.errors import AcwmError, DataError, RecipeError
 from acwm_core.evaluation.videos import to_pixels
+from acwm_core.model.objectives.objective import drawn_noise
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
@@ -36,10 +37,10 @@ SIZE = (64, 64)
 OLD = pytest.mark.skipif(torch.__version__ < NEEDS_TORCH, reason=f"needs PyTorch {NEEDS_TORCH}")
 
 
-def recurrent_world(given=1):
+def recurrent_world(given=1, **parameters):
     """A small recurrent model with weights that make it follow actions and forget nothing."""
     codec = catalog().create("codec", "identity")
-    sizes = {"channels": 8, "width": 16, "blocks": 1}
+    sizes = {"channels": 8, "width": 16, "blocks": 1, **parameters}
     model = catalog().create("model", "recurrent", latent_channels=codec.channels, **sizes)
     about = {"width": model.width, "layers": model.layers, "heads": model.heads}
     conditioner = catalog().create(
@@ -72,6 +73,24 @@ def test_the_graphs_of_a_model_that_is_given_more_frames_are_its_stream():
         np.testing.assert_allclose(stream.step(rows[0].numpy()), wanted, atol=1e-4)
         seen.append(wanted[-1])
     assert (seen[-1] - seen[1]).abs().max() > 0.01  # something moves
+
+
+@OLD
+@pytest.mark.slow
+def test_the_graphs_of_a_model_that_draws_take_its_noise():
+    world = recurrent_world(noise=6)
+    made = export_graphs(world, SIZE)
+    given = torch.rand(1, 3, *SIZE)
+    actions = torch.rand(1, 4, 2) * 2 - 1
+    seen = {}
+    for seed in (1, 2):
+        draw = drawn_noise((6,), [torch.Generator().manual_seed(seed)]).numpy()
+        stream = OnnxStream(made, given.numpy(), [draw])
+        seen[seed] = stream.step(actions[0].numpy())
+        truth = world.stream(given, seeds=[seed]).step(actions)[0]
+        np.testing.assert_allclose(seen[seed], truth, atol=1e-4)
+    assert np.abs(seen[1] - seen[2]).max() > 1e-3
+    check(made, world, given.numpy(), actions[0].numpy())
 
 
 def test_models_that_cannot_be_exported_are_refused():

@@ -82,6 +82,8 @@ class Objective(ABC, Generic[ModelT]):
             latents or levels, by name (`Denoiser.inputs`).
         steps: default number of network evaluations per prediction; None if there is no choice.
         learns_states: whether it trains on the agent's states too, see `Batch.states`.
+        draws: whether it trains predictors to draw one of several futures; they have to be able to
+            (`DynamicsModel.samples`).
     """
 
     trains: type[ModelT]
@@ -89,6 +91,7 @@ class Objective(ABC, Generic[ModelT]):
     inputs: Mapping[str, InputKind] = {}
     steps: int | None = None
     learns_states: bool = False
+    draws: bool = False
 
     @abstractmethod
     def loss(self, model: ModelT, batch: Batch, known: int) -> Tensor:
@@ -168,6 +171,12 @@ class Objective(ABC, Generic[ModelT]):
             raise RecipeError(
                 f"{name} needs a model with the further inputs {', '.join(self.inputs)}, which "
                 f"{of} does not take: choose another model or objective=diffusion_forcing"
+            )
+        if self.draws and not model.samples:
+            raise RecipeError(
+                f"{name} needs a model that draws one of several futures, which {of} with these "
+                "parameters does not: set model.noise=32 if it has that parameter, or "
+                "objective=regression"
             )
         if self.causal and not model.causal:
             raise RecipeError(

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError, check_shape
-from acwm_core.model.dynamics import LatentStream, Predictor
+from acwm_core.model.dynamics import DynamicsModel, LatentStream, Predictor
 from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Latent
 
@@ -40,16 +40,35 @@ class Regression(Objective[Predictor]):
         self.state_weight = state_weight
         self.frames = frames
 
+    def check_model(self, model: DynamicsModel) -> None:
+        """Refuse a model that cannot learn by it, or not all that it could; see `Objective`."""
+        super().check_model(model)
+        if model.samples and not self.draws:
+            raise RecipeError(
+                f"{type(self).__name__} teaches the mean of all futures, but "
+                f"{type(model).__name__} draws one: set objective=energy_score, or model.noise=0"
+            )
+
     def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
-        given, true = batch.latents[:, :known], batch.latents[:, known:]
-        only = self._drawn(model, batch, true.shape[1])
+        loss = self.compared(model, batch, known)
+        return loss if batch.states is None else loss + self.state_weight * model.state_loss(batch)
+
+    def compared(self, model: Predictor, batch: Batch, known: int) -> Tensor:
+        """The loss of the predicted pictures, a scalar."""
+        predicted, true = self.predicted(model, batch, known, self.drawn(model, batch, known))
+        return functional.mse_loss(predicted.float(), true.float())
+
+    def predicted(
+        self, model: Predictor, batch: Batch, known: int, only: Tensor | None
+    ) -> tuple[Latent, Latent]:
+        """Predicted and true latents, each `[B, N, C, h, w]`, of all frames or of `only` some."""
+        beginning = replace(batch, latents=batch.latents[:, :known])
+        made = _predicted(model, beginning, batch.latents.shape[1], only)
+        true = batch.latents[:, known:]
         if only is not None:
             true = true.take_along_dim(only[..., None, None, None], 1)
-        beginning = replace(batch, latents=given)
-        predicted = _predicted(model, beginning, batch.latents.shape[1], only)
-        loss = functional.mse_loss(predicted.float(), true.float())
-        return loss if batch.states is None else loss + self.state_weight * model.state_loss(batch)
+        return made, true
 
     def predict(
         self, model: Predictor, given: Batch, frames: int, steps: int | None = None
@@ -74,8 +93,12 @@ class Regression(Objective[Predictor]):
         """Whether the model has a stream: it was trained to carry its state over the clip."""
         return model.streams
 
-    def _drawn(self, model: Predictor, batch: Batch, predicted: int) -> Tensor | None:
-        """The frames of each clip to compare, `[B, N]`; None for all, as in validation."""
+    def drawn(self, model: Predictor, batch: Batch, known: int) -> Tensor | None:
+        """The frames of each clip to compare, `[B, N]`; None for all, as in validation.
+
+        Raises:
+            RecipeError: the model saves no work.
+        """
         if self.frames is None:
             return None
         if not model.skips:
@@ -83,6 +106,7 @@ class Regression(Objective[Predictor]):
                 f"{type(model).__name__} predicts all frames of a clip or none: leave out "
                 "objective.frames"
             )
+        predicted = batch.latents.shape[1] - known
         return batch.picked(self.frames, predicted) if model.training else None
 
 

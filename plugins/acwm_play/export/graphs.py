@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from acwm_core.errors import MissingExtraError, RecipeError
 from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.objectives.objective import drawn_noise
 from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_core.model.world_model import WorldModel
 
@@ -33,12 +34,21 @@ TOLERANCE = 1e-3
 
 @runtime_checkable
 class CarriesState(Protocol):
-    """What a dynamics model must implement to be exported: its stream as functions of tensors."""
+    """What a dynamics model must implement to be exported: its stream as functions of tensors.
 
-    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
+    Attributes:
+        noise: how many standard normal numbers it draws once, at the start; 0 if none.
+    """
+
+    noise: int
+
+    def initial_state(
+        self, given: Latent, conditioning: Conditioning, draw: tuple[Tensor, ...] = ()
+    ) -> tuple[Tensor, ...]:
         """The state after the given latents `[B, K, C, h, w]`.
 
         `conditioning` begins with the entry for the first latent frame, which no action leads to.
+        `draw` is that noise `[B, noise]`, or empty.
         """
         ...
 
@@ -65,14 +75,17 @@ class _Part(nn.Module):
 
 
 class Start(_Part):
-    """Maps the given frames `[1, K, 3, H, W]` to the latent of the last one and the state."""
+    """Maps the given frames `[1, K, 3, H, W]` to the latent of the last one and the state.
 
-    def forward(self, given: Video) -> tuple[Tensor, ...]:
+    For a model that draws, its noise `[1, N]` is a second input.
+    """
+
+    def forward(self, given: Video, *draw: Tensor) -> tuple[Tensor, ...]:
         """Encode the frames and start the stream."""
         latents = self.world.codec.encode(given)
         stride, size = self.world.codec.temporal_stride, len(self.world.action_low)
         nothing = self.embed(given.new_zeros(1, stride, size))
-        return latents[:, -1:], *self.model.initial_state(latents, nothing)
+        return latents[:, -1:], *self.model.initial_state(latents, nothing, draw)
 
 
 class Step(_Part):
@@ -111,16 +124,23 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
     world.eval()
     given = torch.rand(1, world.context_frames, 3, *size)
     actions = world.action_low.expand(1, world.codec.temporal_stride, -1)
+    begin = given, *_draw(world, seed=0)
     with torch.no_grad():
-        latent, *state = Start(world)(given)
+        latent, *state = Start(world)(*begin)
         states = [f"state_{k}" for k in range(len(state))]
         moved = [f"next_{each}" for each in states]
         graph = _graph
         return {
-            "start": graph(Start(world), (given,), ["given"], ["latent", *states]),
+            "start": graph(Start(world), begin, ["given", "noise"], ["latent", *states]),
             "step": graph(Step(world), (actions, *state), ["actions", *states], ["latent", *moved]),
             "decode": graph(Decode(world), (latent,), ["latent"], ["first", "frames"]),
         }
+
+
+def _draw(world: WorldModel, seed: int) -> tuple[Tensor, ...]:
+    """The noise `[1, N]` of a stream with this seed; empty for a model that draws none."""
+    noise = cast(CarriesState, world.model).noise
+    return (drawn_noise((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
 
 
 def _check_exportable(world: WorldModel) -> None:
@@ -159,7 +179,7 @@ def _graph(part: nn.Module, args: tuple[Any, ...], inputs: list[str], outputs: l
             program = torch.onnx.export(
                 part,
                 args,
-                input_names=inputs,
+                input_names=inputs[: len(args)],
                 output_names=outputs,
                 dynamo=True,
                 external_data=False,
@@ -177,19 +197,25 @@ class OnnxStream:
     Args:
         graphs: see `export_graphs`.
         given: frames `[K, 3, H, W]` in [0, 1].
+        draw: noise `[1, N]` of a model that draws, otherwise empty.
 
     Attributes:
         given: the last given frame as the model sees it, `[3, H, W]`.
     """
 
-    def __init__(self, graphs: Mapping[str, bytes], given: NDArray[np.float32]) -> None:
+    def __init__(
+        self,
+        graphs: Mapping[str, bytes],
+        given: NDArray[np.float32],
+        draw: Sequence[NDArray[np.float32]] = (),
+    ) -> None:
         import onnxruntime
 
         self._sessions = {
             name: onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
             for name, graph in graphs.items()
         }
-        latent, *self._state = self._run("start", given[None])
+        latent, *self._state = self._run("start", given[None], *draw)
         first, later = self._run("decode", latent)
         self.given: NDArray[np.float32] = (first if len(given) == 1 else later)[0, -1]
 
@@ -222,8 +248,9 @@ def check(
         RecipeError: the two differ by more than `TOLERANCE`.
     """
     still = world.action_low.expand(1, len(given) - 1, -1)
-    truth = world.stream(torch.from_numpy(given)[None], still)
-    stream, stride = OnnxStream(graphs, given), world.codec.temporal_stride
+    truth = world.stream(torch.from_numpy(given)[None], still, seeds=[0])
+    draw = [each.numpy() for each in _draw(world, seed=0)]
+    stream, stride = OnnxStream(graphs, given, draw), world.codec.temporal_stride
     worst = float(np.abs(stream.given - truth.given[0, -1].numpy()).max())
     for start in range(0, len(actions), stride):
         rows = actions[start : start + stride]

@@ -45,14 +45,16 @@ function inference() {
 
   const work = {
     begin,
-    async start({ frames, dims: [n, height, width] }) {
+    async start({ frames, dims: [n, height, width], draw }) {
       const size = height * width, data = new Float32Array(frames.length);
       for (let k = 0; k < n; k += 1) {
         for (let c = 0; c < 3; c += 1) {
           for (let i = 0; i < size; i += 1) data[(3 * k + c) * size + i] = frames[3 * (k * size + i) + c] / 255;
         }
       }
-      const [latent, ...begun] = await run("start", new ort.Tensor("float32", data, [1, n, 3, height, width]));
+      const given = new ort.Tensor("float32", data, [1, n, 3, height, width]);
+      const noise = draw.length ? [new ort.Tensor("float32", draw, [1, draw.length])] : [];
+      const [latent, ...begun] = await run("start", given, ...noise);
       state = begun;
       const decoded = pixels((await run("decode", latent))[n === 1 ? 0 : 1]);
       return decoded.slice(-3 * size);
@@ -108,7 +110,8 @@ class Engine {
   }
 
   // The last of the given frames as the model sees it; the stream begins with them.
-  start(frames, dims) { return this.ask("start", { frames, dims }); }
+  // `draw` is the noise of a model that draws one of several futures, otherwise empty.
+  start(frames, dims, draw) { return this.ask("start", { frames, dims, draw }); }
 
   // The frames of the next latent frame.
   step(actions) { return this.ask("step", { actions }); }

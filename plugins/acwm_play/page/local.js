@@ -7,7 +7,7 @@ class LocalServer {
     this.readyState = WebSocket.OPEN;
     Object.assign(this, { paused: false, speed: 1, driver: "policy", wanted: null, again: false, stepping: false });
     Object.assign(this, { values: null, places: null, seq: 0, alone: 0, pace: 0, due: 0, wake: () => {} });
-    Object.assign(this, { episode: null, at: 0, drifted: false, predicting: null });
+    Object.assign(this, { episode: null, at: 0, drifted: false, predicting: null, draw: null });
     this.run().catch((error) => this.tell("notice", { text: `The model cannot run in this browser: ${error.message}`, wrong: true }));
   }
 
@@ -27,6 +27,7 @@ class LocalServer {
   note(wish) {
     if (wish.type === "open") this.wanted = wish;
     else if (wish.type === "take_over") this.again = true;
+    else if (wish.type === "redraw") [this.again, this.draw] = [true, null];
     else if (wish.type === "pause") this.paused = wish.on;
     else if (wish.type === "step") this.stepping = true;
     else if (wish.type === "speed") this.speed = wish.value;
@@ -70,9 +71,10 @@ class LocalServer {
   async start() {
     this.again = false;
     await this.predicting;
-    const { given, size: [height, width] } = this.about;
+    const { given, noise, size: [height, width] } = this.about;
+    this.draw ??= Float32Array.from({ length: noise }, normal);
     const from = Math.max(this.at - given + 1, 0);
-    const seen = await this.engine.start(this.recorded(from, from + given), [given, height, width]);
+    const seen = await this.engine.start(this.recorded(from, from + given), [given, height, width], this.draw);
     [this.alone, this.drifted] = [0, false];
     this.show(this.recorded(this.at, this.at + 1), seen, [this.seq], true);
     this.tellState();
@@ -157,6 +159,11 @@ class LocalServer {
     packed.set(seen, 4 + text.length + seen.length);
     this.onmessage({ data: packed.buffer });
   }
+}
+
+// A standard normal number, by Box and Muller.
+function normal() {
+  return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
 }
 
 // A point through a homography.

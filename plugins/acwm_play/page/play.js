@@ -321,6 +321,7 @@ function enter(about) {
   document.querySelector(".sim figcaption b").textContent = about.recorded ? "Recording" : "Simulator";
   document.body.classList.toggle("recorded", about.recorded);
   document.body.classList.toggle("drawing", Boolean(about.samples));
+  $("redraw").hidden = !(about.samples || about.noise);
   document.body.classList.toggle("wide-frames", about.size[1] > 1.5 * about.size[0]);
   $("engine").textContent = about.engine;
   $("summary").textContent = about.summary;
