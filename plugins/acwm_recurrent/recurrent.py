@@ -223,11 +223,12 @@ class RecurrentModel(Predictor):
         return State(grid, vector, state.base, state.draw, tuple(agent)), vector + action
 
     def initial_state(
-        self, given: Latent, conditioning: Conditioning, draw: tuple[Tensor, ...] = ()
+        self, given: Latent, conditioning: Conditioning, *draw: Tensor
     ) -> tuple[Tensor, ...]:
         """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors.
 
-        `conditioning` starts at the first latent frame, and may be longer.
+        `conditioning` starts at the first latent frame, and may be longer. `draw` is the noise of a
+        model that draws, `[B, noise]`.
         """
         return _tensors(self.start(given, self.actions(conditioning)[:, 0], draw))
 
@@ -278,7 +279,7 @@ class _RecurrentStream(LatentStream):
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""
         if self._state is None:
-            self._state = self._model.initial_state(self._given, conditioning, self._draw)
+            self._state = self._model.initial_state(self._given, conditioning, *self._draw)
         latent, self._state = self._model.next_state(self._state, conditioning)
         return latent
 

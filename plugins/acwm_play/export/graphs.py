@@ -36,19 +36,16 @@ TOLERANCE = 1e-3
 class CarriesState(Protocol):
     """What a dynamics model must implement to be exported: its stream as functions of tensors.
 
-    Attributes:
-        noise: how many standard normal numbers it draws once, at the start; 0 if none.
+    One that draws a future has an attribute ``noise``, how many standard normal numbers it draws at
+    the start, and `initial_state` takes them as a further argument `[B, noise]`.
     """
 
-    noise: int
-
     def initial_state(
-        self, given: Latent, conditioning: Conditioning, draw: tuple[Tensor, ...] = ()
+        self, given: Latent, conditioning: Conditioning, *draw: Tensor
     ) -> tuple[Tensor, ...]:
         """The state after the given latents `[B, K, C, h, w]`.
 
         `conditioning` begins with the entry for the first latent frame, which no action leads to.
-        `draw` is that noise `[B, noise]`, or empty.
         """
         ...
 
@@ -85,7 +82,7 @@ class Start(_Part):
         latents = self.world.codec.encode(given)
         stride, size = self.world.codec.temporal_stride, len(self.world.action_low)
         nothing = self.embed(given.new_zeros(1, stride, size))
-        return latents[:, -1:], *self.model.initial_state(latents, nothing, draw)
+        return latents[:, -1:], *self.model.initial_state(latents, nothing, *draw)
 
 
 class Step(_Part):
@@ -137,9 +134,14 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
         }
 
 
+def drawn_numbers(world: WorldModel) -> int:
+    """How many numbers a draw of the model takes; 0 for a model that draws none."""
+    return getattr(world.model, "noise", 0)
+
+
 def _draw(world: WorldModel, seed: int) -> tuple[Tensor, ...]:
     """The noise `[1, N]` of a stream with this seed; empty for a model that draws none."""
-    noise = cast(CarriesState, world.model).noise
+    noise = drawn_numbers(world)
     return (drawn_noise((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
 
 
