@@ -207,14 +207,14 @@ class RecurrentModel(Predictor):
             state: state of the previous frame.
             action: the embedded actions that lead to the next frame, `[B, width]`.
         """
-        if self.future:
-            action = action + self.future(*state.draw)
         agent = state.agent
         if self.agent:
             # Only true states teach it: the picture's error must not bend what is known of it.
             with torch.no_grad():
                 agent = self.agent.step(Agent(*agent), action)
             action = action + self.agent.embed(agent.state)
+        if self.future:
+            action = action + self.future(*state.draw)
         pooled = functional.adaptive_avg_pool2d(state.grid, STEP_CELLS).flatten(1)
         vector = self.gru(torch.cat([action, self.read_grid(pooled)], -1), state.vector)
         grid = state.grid

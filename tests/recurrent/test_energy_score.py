@@ -1,5 +1,7 @@
 """A recurrent model that draws one of several futures, and the score that teaches it to."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -106,6 +108,16 @@ def test_a_draw_is_taken_by_agent_and_stream_alike():
         for first, stop in ((0, 2), (1, 3), (2, 4))
     ]
     torch.testing.assert_close(torch.cat(frames, 1), whole)
+    states = [
+        functools.reduce(
+            lambda state, frame: model.step(state, modulation[:, frame])[0],
+            range(1, 4),
+            model.start(given, modulation[:, 0], (torch.randn(2, 5),)),
+        )
+        for _ in range(2)
+    ]
+    torch.testing.assert_close(states[0].agent, states[1].agent)  # what it knows is no draw
+    assert not torch.equal(states[0].grid, states[1].grid)
 
 
 def test_only_models_that_draw_are_taught_to():
