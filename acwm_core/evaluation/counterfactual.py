@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import ActionSpec, Environment
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
@@ -20,6 +19,7 @@ from acwm_core.evaluation.clips import Clip, Predictor, cut_episode, donor_actio
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve
+from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
 from acwm_core.evaluation.summarise import summary_of
 from acwm_core.evaluation.videos import ShownClip, shown
@@ -123,10 +123,12 @@ def simulate_branches(
     """Simulate each clip again, cut to at most `frames` frames, and its branches."""
     for clip, whole in read_clips(clips, episodes):
         episode, branches = branches_of(environment, clip, whole, episodes, frames)
-        truths: list[Prediction] = []
-        for actions in [episode.actions, *(branch.actions for branch in branches)]:
-            made = simulate(environment, episode.spec, actions, frames=len(episode.video))
-            truths.append(Prediction.truth(made, environment.card, estimator, clip))
+        taken = [episode.actions, *(branch.actions for branch in branches)]
+        asked = [Again(episode.spec, actions, len(episode.video)) for actions in taken]
+        truths = [
+            Prediction.truth(made, environment.card, estimator, clip)
+            for made in simulate_again(environment, episodes, asked)
+        ]
         yield branches, replace(truths[0], branches=tuple(truths[1:]))
 
 

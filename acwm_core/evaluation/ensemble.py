@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
@@ -24,6 +22,7 @@ from acwm_core.evaluation.clips import Clip, as_clip, read_clips
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Ensemble
+from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import ClipScores, Estimate, Values, finite
 from acwm_core.evaluation.videos import to_pixels
 
@@ -66,7 +65,9 @@ def compare_ensembles(
         amounts.append(start_doubt(episode, evaluator.estimator))
         truth = Prediction.truth(episode, evaluator.card, None, clip)
         starts = evaluator.config.ensemble_starts
-        simulated = _simulated(environment, episode, amounts[-1], starts)
+        moved = Again(episode.spec, episode.actions, len(episode.video), amounts[-1])
+        asked = [moved._replace(start=start) for start in range(1, starts + 1)]
+        simulated = [each.video for each in simulate_again(environment, episodes, asked)]
         with noting(clip.where, *evaluator.world_model.children()):
             futures = _futures(evaluator, truth, simulated)
         seen = {name: [each[clip.given - 1 :] for each in of] for name, of in futures.items()}
@@ -110,17 +111,6 @@ def start_doubt(episode: Episode, estimator: StateEstimator) -> float:
         exists = np.asarray(episode.states[reading.present][0] if reading.present else 1) > 0
         moves.append(seen[np.broadcast_to(exists, seen.shape)].ravel())
     return float(RESOLVED / np.median(np.concatenate(moves)))
-
-
-def _simulated(
-    environment: Environment, episode: Episode, amount: float, starts: int
-) -> list[Pixels]:
-    again = partial(simulate, environment, episode.spec, episode.actions)
-    frames = len(episode.video)
-    return [
-        again(frames=frames, perturbation=amount, start=start).video
-        for start in range(1, starts + 1)
-    ]
 
 
 def _futures(evaluator: Evaluator, truth: Prediction, simulated: Sequence[Pixels]) -> Futures:

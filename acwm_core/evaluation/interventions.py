@@ -29,6 +29,7 @@ from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.evaluation.results import Counterfactual, Ensemble, Predictability, Score
 from acwm_core.evaluation.score import build_metrics, score, split_available
+from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import finite
 from acwm_core.evaluation.videos import ShownClip
 from acwm_core.model.world_model import CLIP_FRAMES
@@ -195,8 +196,8 @@ def perturbed(
     scores: list[Score] = []
     errors: list[NDArray[np.float64]] = []
     for clip, episode in read_clips(clips, episodes):
-        frames = len(episode.video)
-        moved = simulate(environment, episode.spec, episode.actions, frames=frames, perturbation=1)
+        asked = Again(episode.spec, episode.actions, len(episode.video), perturbation=1)
+        (moved,) = simulate_again(environment, episodes, [asked])
         truth = Prediction.truth(episode, evaluator.card, evaluator.estimator, clip)
         made = replace(truth, video=as_clip(moved.video), kind="perturbed")
         scores.append(score(made, evaluator.metrics))

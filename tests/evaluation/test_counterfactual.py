@@ -1,5 +1,7 @@
 """Counterfactual response: known models stand where theory puts them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -34,7 +36,9 @@ SIMULATED = {}
 
 
 class Episodes(list):
-    """Episodes in memory."""
+    """Episodes in memory, with no folder that could keep anything."""
+
+    path = Path("/nowhere")
 
     def actions(self, index):
         return self[index].actions

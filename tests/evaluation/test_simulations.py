@@ -1,0 +1,103 @@
+"""What an evaluation simulates again is kept for the next model, and never out of date."""
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from acwm_core.checks.disc import Disc
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.simulate import simulate
+from acwm_core.env.episode import EpisodeSpec
+from acwm_core.evaluation import simulations
+from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_core.evaluation.interventions import simulator_of
+from acwm_core.evaluation.simulations import Again, simulate_again
+from tests import tiny
+
+
+@pytest.fixture
+def own(data, tmp_path):
+    """A dataset of one's own, of which nothing is kept yet."""
+    folder = shutil.copytree(data, tmp_path / "data")
+    shutil.rmtree(folder / "references", ignore_errors=True)
+    return folder
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """The specs of all episodes that are simulated."""
+    seen = []
+    simulate = simulations.simulate
+
+    def watched(environment, spec, *arguments, **options):
+        seen.append((spec.split, spec.index))
+        return simulate(environment, spec, *arguments, **options)
+
+    monkeypatch.setattr(simulations, "simulate", watched)
+    return seen
+
+
+def test_another_model_is_evaluated_on_what_was_simulated_for_the_first(own, simulated, tmp_path):
+    asks = {"perturbed_episodes": 2, "ensemble_episodes": 1, "ensemble_starts": 4}
+    run = tiny.make_run(tmp_path / "run", own, videos=0, **asks)
+    first = evaluate_run(run, progress=False)
+    assert simulated
+    simulated.clear()
+    assert evaluate_run(run, progress=False).splits == first.splits
+    assert simulated == []
+    shutil.rmtree(own / "references")
+    assert evaluate_run(run, progress=False).splits == first.splits
+
+
+def asked(episode, **changes):
+    frames = len(episode.video)
+    return [
+        Again(episode.spec, episode.actions, frames),
+        Again(episode.spec, 0 * episode.actions, frames, **changes),
+    ]
+
+
+@pytest.mark.parametrize("harm", ["cut off", "another version", "a file in its place"])
+def test_what_cannot_be_used_is_simulated_again(own, simulated, harm, monkeypatch):
+    episodes = EpisodeDataset(own, "ind_test")
+    environment, episode = simulator_of(episodes), episodes[1]
+    if harm == "a file in its place":
+        (own / "references").write_text("")
+    made = simulate_again(environment, episodes, asked(episode))
+    if harm == "cut off":
+        (file,) = (own / "references").iterdir()
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    if harm == "another version":
+        monkeypatch.setattr(simulations, "package_hash", lambda name: "other code")
+    simulated.clear()
+    again = simulate_again(environment, episodes, asked(episode))
+    assert simulated == [("ind_test", 1)] * 2
+    if harm != "a file in its place":
+        simulated.clear()
+        again = simulate_again(environment, episodes, asked(episode))
+        assert not simulated
+        assert len([*(own / "references").iterdir()]) == 1  # the old one was replaced
+    for one, other in zip(made, again, strict=True):
+        assert one.spec == other.spec == episode.spec
+        for name in ("video", "actions", "masks", "contacts"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        assert one.states.keys() == other.states.keys()
+        for name, values in one.states.items():
+            np.testing.assert_array_equal(values, other.states[name])
+            assert values.dtype == other.states[name].dtype
+    np.testing.assert_array_equal(made[0].video, episode.video)
+
+
+def test_whatever_is_asked_differently_is_simulated(simulated, tmp_path):
+    environment, episodes = Disc(size=(32, 48)), SimpleNamespace(path=tmp_path)
+    episode, second = (simulate(environment, EpisodeSpec("disc", "train", k)) for k in range(2))
+    changes = [{}, {"perturbation": 1.0}, {"perturbation": 2.0}, {"perturbation": 1.0, "start": 1}]
+    for number, change in enumerate(changes, 1):
+        simulate_again(environment, episodes, asked(episode, **change))
+        assert len(simulated) == 2 * number
+    simulate_again(environment, episodes, asked(second))
+    shorter = [each._replace(frames=each.frames - 1) for each in asked(episode)]
+    simulate_again(environment, episodes, [s._replace(actions=s.actions[:-1]) for s in shorter])
+    assert len(simulated) == 2 * len(changes) + 4
