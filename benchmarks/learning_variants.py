@@ -78,6 +78,12 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "fine codec": FINE,
     "fine codec, read at once": (*FINE, *READING),
     "fine codec, read at once, joints": (*FINE, *READING, JOINTS),
+    "fine codec, read at once, joints, four frames": (
+        *FINE,
+        *READING,
+        JOINTS,
+        "objective.frames=4",
+    ),
     "fine codec, one block and three, joints": (
         *FINE,
         "model.blocks=1",
