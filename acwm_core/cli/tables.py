@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 
 def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
-    """A table without lines: a column of names and columns of numbers; cells never wrap."""
+    """A table without lines: a column of names and columns of numbers; cells never wrap.
+
+    Print it by `print_table` if it may be wider than a terminal.
+    """
     from rich.table import Table
 
     table = Table(box=None, title=title, title_justify="left", title_style="bold")
@@ -18,3 +22,37 @@ def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
     for heading in numbers:
         table.add_column(heading.replace(" ", "\n"), justify="right", no_wrap=True)
     return table
+
+
+def print_table(
+    console: Console,
+    title: str,
+    numbers: Sequence[str],
+    rows: Sequence[tuple[str, Sequence[str]]],
+) -> None:
+    """Print a `plain_table`; columns that do not fit beside the others follow below them.
+
+    Args:
+        console: where to.
+        title: its title.
+        numbers: headings of the columns of numbers.
+        rows: a name, and a cell for each column.
+    """
+    from rich.measure import Measurement
+
+    def table(columns: Sequence[int], title: str | None) -> Table:
+        made = plain_table(title, "", [numbers[column] for column in columns])
+        for name, cells in rows:
+            made.add_row(name, *(cells[column] for column in columns))
+        return made
+
+    left, unbounded = list(range(len(numbers))), console.options.update(max_width=10_000)
+    while left:
+        fitting = left[:1]
+        while len(fitting) < len(left):
+            wider = table(left[: len(fitting) + 1], None)
+            if Measurement.get(console, unbounded, wider).maximum > console.width:
+                break
+            fitting = left[: len(fitting) + 1]
+        console.print(table(fitting, title if fitting[0] == 0 else None))
+        left = left[len(fitting) :]

@@ -100,12 +100,14 @@ def paired_bootstrap(
     mean, count = float(values.mean()), len(values)
     if count < MIN_EPISODES or not np.isfinite(values).all():
         return PairedDifference(mean, None, None, None, count)
+    # By chance, all differences have the same sign in one of 2^(n − 1) cases (sign test).
+    least = max(0.5 ** (count - 1), 1 / (resamples + 1))
     error = standard_error(values)
     if error <= FLAT * abs(mean):  # all differences are the same number
-        return PairedDifference(mean, mean, mean, 1.0 if mean == 0 else 1 / (resamples + 1), count)
+        return PairedDifference(mean, mean, mean, 1.0 if mean == 0 else least, count)
     extremes = np.abs(studentised([values], seed, resamples))
     found = around(mean, extremes * error)
-    p = (1 + int((extremes >= abs(mean) / error).sum())) / (resamples + 1)
+    p = max(least, (1 + int((extremes >= abs(mean) / error).sum())) / (resamples + 1))
     return PairedDifference(mean, found.low, found.high, p, count)
 
 

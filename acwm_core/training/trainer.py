@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -106,14 +107,20 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error in one line; for jsonargparse's lists of reasons, the first one."""
+    """The message of an error in one line.
+
+    Of jsonargparse's lists of reasons, it is the values that would do, or else the first reason.
+    """
     message = str(error)
-    head, found, reasons = message.partition("Errors:")
-    if found:
-        key = head.split("\n")[0].removeprefix('Parser key "').removesuffix('":')
-        first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
-        message = f"{key}: {first}"
-    return " ".join(message.split())
+    if about := re.match(r'Parser key "(.+?)":(.*)', message, re.DOTALL):
+        key, what = about.groups()
+        _, found, reasons = what.partition("Errors:")
+        if found:
+            values = re.findall(r"typing\.Literal\[(.*?)\]", reasons)
+            first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
+            what = f"expected one of {', '.join(values)}" if values else first
+        message = f"{key}: {what}"
+    return " ".join(re.sub(r"a <class '(\w+)'>", r"\1", message).split())
 
 
 def _listed(given: Any) -> list[Any]:

@@ -120,6 +120,11 @@ class Tasks:
         known = self.benchmark.worlds
         for name in names:
             if name not in known:
+                if "=" in name:
+                    raise DataError(
+                        f"{name} is a setting of the evaluation, and {self.folder} has them "
+                        f"already: give it to `acwm benchmark export`"
+                    )
                 raise DataError(f"{self.folder} has no tasks of {name!r}{suggest(name, known)}")
         return [known[name] for name in (names or known)]
 

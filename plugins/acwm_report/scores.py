@@ -17,7 +17,7 @@ ModelScores = Mapping[tuple[str, str], Estimate]
 """A model's scores by split and metric."""
 
 
-CAPTION = "▼: worse out of distribution than in distribution."
+CAPTION = "▼: worse out of distribution than in distribution, by more than the intervals allow."
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,17 @@ class ScoreGrid:
             worse = False
             if split == "ood_test" and score and near and None not in (score.value, near.value):
                 change = (score.value or 0) - (near.value or 0)
-                worse = change < 0 if self.metrics[name].higher_is_better else change > 0
+                loss = -change if self.metrics[name].higher_is_better else change
+                worse = loss > math.hypot(_reach(score), _reach(near))
             cells.append(Cell.of(score, self.scales[name], worse=worse))
         return cells
+
+
+def _reach(score: Estimate) -> float:
+    """Half the interval; 0 if there is none, as for published scores."""
+    if score.low is None or score.high is None:
+        return 0.0
+    return (score.high - score.low) / 2
 
 
 def model_scores(summary: Summary) -> ModelScores:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.tables import plain_table
+from acwm_core.cli.tables import plain_table, print_table
 from acwm_report.draws import draws_phrase
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def print_summary(summary: Summary) -> None:
 
     console = Console(highlight=False, markup=False)
     for split, result in summary.splits.items():
-        console.print(_split_table(summary, split))
+        print_table(console, *_split_table(summary, split))
         _print_remarks(result.scores, summary.handed_in)
         if phrase := draws_phrase(summary, split):
             click.echo(f"{split}: {phrase}")
@@ -122,7 +122,10 @@ def _text(estimate: Estimate, *, interval: bool = True) -> str:
     return text
 
 
-def _split_table(summary: Summary, split: str) -> Table:
+def _split_table(
+    summary: Summary, split: str
+) -> tuple[str, list[str], list[tuple[str, list[str]]]]:
+    """Title, headings and rows of the scores of a split."""
     scores = summary.splits[split].scores
     clips = f"{scores.clips} clips"
     if scores.episodes != scores.clips:
@@ -132,7 +135,7 @@ def _split_table(summary: Summary, split: str) -> Table:
     place = list(scores.rows).index("model") + 1
     if shares:
         heads.insert(place, "scored")
-    table = plain_table(f"{split}: {clips}", "", heads)
+    rows: list[tuple[str, list[str]]] = []
     for name, metric in summary.metrics.items():
         shown = [
             _text(values[name], interval=row == "model" and name == summary.headline)
@@ -140,8 +143,8 @@ def _split_table(summary: Summary, split: str) -> Table:
         ]
         if shares:
             shown.insert(place, f"{100 * shares[name]:.0f} %" if name in shares else "")
-        table.add_row(f"{name} {metric.unit}".strip(), *shown)
-    return table
+        rows.append((f"{name} {metric.unit}".strip(), shown))
+    return f"{split}: {clips}", heads, rows
 
 
 def _print_curves(summary: Summary) -> None:
@@ -215,11 +218,14 @@ def about_published(summary: Summary) -> str:
     row, same = summary.published.row, summary.published.same_parts
     setting = ", ".join(str(row.setting[name]) for name in ("model", "codec", "conditioner"))
     facts = [f"published: {row.citation}, {row.label} ({setting})"]
-    if not same:
+    if not (same or summary.handed_in):  # what made predictions handed in is not known
         facts.append("this run has other components")
     table = published_tables().get(row.table)  # none where its plugin is not installed
     if table and summary.protocol != table.protocol:
-        facts.append(f"measured on other clips: compare with --protocol {table.protocol}")
+        to_compare = f"--protocol {table.protocol}"
+        if summary.handed_in:
+            to_compare = f"`acwm benchmark export evaluation.protocol={table.protocol}`"
+        facts.append(f"measured on other clips: compare with {to_compare}")
     return "; ".join(facts) + (f". {row.note}" if row.note else "")
 
 

@@ -98,6 +98,13 @@ def test_missing_extra_and_double_ones_are_told(given, folder):
     assert "holds no predictions of slide" in fault(given, folder / "slide")
 
 
+def test_worlds_of_no_task_are_told(given):
+    with pytest.raises(DataError, match=r"no tasks of 'slid'.*slide"):
+        given.worlds(["slid"])
+    with pytest.raises(DataError, match="give it to `acwm benchmark export`"):
+        given.worlds(["evaluation.metrics=[psnr]"])
+
+
 def test_numbers_of_draws_are_told(given, folder):
     (folder / f"{CLIP}.npz").unlink()
     for draw in (0, 2):

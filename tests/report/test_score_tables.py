@@ -4,13 +4,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from acwm_core.evaluation.metric import MetricInfo
 from acwm_core.evaluation.protocol import published_for
+from acwm_core.evaluation.statistics import Estimate
 from acwm_core.plugins import Catalog
 from acwm_report import run as runs
 from acwm_report.run import EvaluatedRun, described
-from acwm_report.scores import main_table
+from acwm_report.scores import ScoreGrid, main_table
 from acwm_report.tables import score_tables, state_tables
 from tests.report import synthetic
 
@@ -50,7 +52,18 @@ def test_runs_of_one_environment_are_told_apart_and_share_the_published_row(tmp_
     titles = [row.title for row in table.rows]
     assert titles == ["plain", "attentive", "published", "Reacher", "published"]
     assert [row.link for row in table.rows] == ["run1", "run2", "", "run3", ""]
-    assert [cell.worse for cell in table.rows[0].cells] == [False, False, True, True]
+
+
+@pytest.mark.parametrize(("reach", "worse"), [(None, True), (0.6, True), (0.8, False)])
+def test_a_drop_is_marked_if_the_intervals_do_not_explain_it(reach, worse):
+    """Two intervals of half-width r explain a difference up to r √2."""
+    ends = [(None, None) if reach is None else (v - reach, v + reach) for v in (31.0, 30.0)]
+    scores = {
+        (split, "psnr"): Estimate(value, *both)
+        for split, value, both in zip(("ind_test", "ood_test"), (31.0, 30.0), ends, strict=True)
+    }
+    grid = ScoreGrid.of([scores], {"psnr": MetricInfo("dB", True, "pixels")})
+    assert [cell.worse for cell in grid.cells(scores)] == [False, worse]
 
 
 def test_there_is_none_without_metrics_of_pixels(tmp_path):

@@ -65,7 +65,11 @@ def test_equal_runs_and_constant_shifts():
     assert (equal.mean, equal.low, equal.high, equal.p) == (0.0, 0.0, 0.0, 1.0)
     shifted = paired_bootstrap([0.25] * 9)
     assert (shifted.low, shifted.high) == (0.25, 0.25)
-    assert shifted.p == pytest.approx(1 / (RESAMPLES + 1))
+    for pairs in (5, 9, 12):  # no surer than the sign test
+        least = stats.binomtest(pairs, pairs).pvalue
+        assert paired_bootstrap([0.25] * pairs).p == pytest.approx(least)
+        assert paired_bootstrap(1 + 1e-3 * np.arange(pairs)).p == pytest.approx(least)
+    assert paired_bootstrap([0.25] * 40).p == pytest.approx(1 / (RESAMPLES + 1))
 
 
 def test_few_pairs_have_a_mean_alone():

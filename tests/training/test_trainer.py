@@ -71,6 +71,8 @@ def test_ours_make_room_for_the_users():
         ({"max_epochs": 3}, "set trainer.max_steps=… in place of trainer.max_epochs"),
         ({"max_steps": -1}, "nothing says how long to train"),
         ({"precision": "bf16-true"}, "use bf16-mixed"),
+        ({"precision": "fp8"}, "trainer.precision: expected one of 'transformer-engine'"),
+        ({"max_steps": 1e3}, "trainer.max_steps: Expected int. Got value: 1000.0"),
         ({"logger": ["csv", "wandbb"]}, "did you mean 'wandb'"),
         ({"logger": {"class_path": "lightning.pytorch.loggers.NoLogger"}}, "section trainer"),
     ],
