@@ -110,30 +110,30 @@ def draw_landscapes(
     run: Path, task: str, settings: Settings, seeds: Sequence[int], out: Path, device: str
 ) -> None:
     """Draw the cost landscape of each episode, and print where the true action is in it."""
+    from acwm_core.executors import progress_bar
     from acwm_core.training.run import load_run
-    from acwm_planning.landscape import draw, landscape
+    from acwm_planning.landscape import SIDE, draw, landscape
     from acwm_planning.left_out import LeftOut
     from acwm_planning.run import EpisodePlayer, usual_actions
 
-    player, left, drawn = (
-        EpisodePlayer(load_run(run), task, settings, device, usual_actions(run)),
-        LeftOut(),
-        0,
-    )
+    player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))
+    left, told = LeftOut(), list[str]()
+    click.echo(f"per episode, {SIDE * SIDE + 1} plans in the simulator and in the model", err=True)
     try:
-        for seed in seeds:
-            with left.trying("the landscape", seed):
-                found = landscape(player, seed)
-                path = draw(found, player.card.action, out / f"landscape-{seed:04d}.png")
-                shares = ", ".join(
-                    f"{rank:.1%} in the {each}" for each, rank in found.ranks.items()
-                )
-                click.echo(f"{path}: cheaper than the true action are {shares}")
-                drawn += 1
-        if left.error and not drawn:
+        with progress_bar(f"landscapes of {task}", len(seeds)) as advance:
+            for seed in seeds:
+                with left.trying("the landscape", seed):
+                    found = landscape(player, seed)
+                    path = draw(found, player.card.action, out / f"landscape-{seed:04d}.png")
+                    ranks = found.ranks.items()
+                    shares = ", ".join(f"{rank:.1%} in the {each}" for each, rank in ranks)
+                    told.append(f"{path}: cheaper than the true action are {shares}")
+                advance(1)
+        if left.error and not told:
             raise left.error
     finally:
         player.close()
+    click.echo("\n".join(told))
 
 
 def print_table(table: Sequence[RowSummary]) -> None:
