@@ -16,6 +16,9 @@ FOLLOWS = "follows_model"
 """Key of the section `objective`: a model with an objective of its own learns by that instead. It
 is set where such a model is chosen later than the objective, and where a recipe says so."""
 
+OWN = "own"
+"""Key in that section for the names of parameters that were given to the model's own objective."""
+
 INHERITED = "inherited"
 """Key in a recipe's section `objective` for the parameters of objectives that it replaced."""
 
@@ -27,6 +30,10 @@ def chosen(changes: Mapping[str, Any], merged: dict[str, Any]) -> dict[str, Any]
         merged["objective"].pop(FOLLOWS, None)
     elif objective_of(changes.get("model") or {}):
         merged["objective"] = {**(merged.get("objective") or {}), FOLLOWS: True}
+    section: Mapping[str, Any] = merged.get("objective") or {}
+    if "name" not in objective and section.get(FOLLOWS) and objective_of(merged.get("model") or {}):
+        own = sorted({*section.get(OWN, ()), *objective} - {FOLLOWS})
+        merged["objective"] = {**section, OWN: own}
     return merged
 
 
@@ -43,7 +50,8 @@ def inherited(old: Mapping[str, Any]) -> dict[str, Any]:
     until it is known which of them the new one takes.
     """
     before = old.get(INHERITED, {})
-    own = {name: value for name, value in old.items() if name not in ("name", FOLLOWS, INHERITED)}
+    notes = ("name", FOLLOWS, INHERITED, OWN)
+    own = {name: value for name, value in old.items() if name not in notes}
     return {INHERITED: {**before, **own}}
 
 
@@ -51,15 +59,21 @@ def resolved(recipe: Mapping[str, Any]) -> dict[str, Any]:
     """A composed recipe with its final objective.
 
     If the model was chosen without an objective, e.g. by ``model=recurrent``, it is the one that
-    the model was registered with, if any; else the one that the recipe names.
+    the model was registered with, if any, with the parameters that were given with that model or
+    later; else the one that the recipe names.
     """
     objective: Any = recipe.get("objective") or {}
     if not isinstance(objective, Mapping):
         return {**recipe}  # the check of the section says what is wrong
     values = {"name": USUAL, **cast(Mapping[str, Any], objective)}
-    own = objective_of(recipe.get("model") or {})
-    if (values.pop(FOLLOWS, False) or "name" not in objective) and own:
-        values = {"name": own}
+    own, given = objective_of(recipe.get("model") or {}), values.pop(OWN, ())
+    follows = values.pop(FOLLOWS, False)
+    if "name" not in objective and own:
+        values["name"] = own
+    elif follows and own:
+        values = {"name": own, **{name: values[name] for name in given}}
+    else:  # another model was chosen later
+        values = {name: value for name, value in values.items() if name not in given}
     return {**recipe, "objective": values}
 
 

@@ -58,7 +58,14 @@ def test_keys_come_with_their_values():
         (
             "fit push_cube_small objective =",
             "",
-            ["diffusion_forcing", "full_sequence", "next_frame", "regression", "shortcut"],
+            [
+                "diffusion_forcing",
+                "energy_score",
+                "full_sequence",
+                "next_frame",
+                "regression",
+                "shortcut",
+            ],
         ),
         ("fit push_cube_small data.clip_starts", "", ["anywhere", "episode"]),
         ("fit push_cube_small", "training.compile=t", ["training.compile=true"]),

@@ -12,6 +12,7 @@ def make_run(folder, data):
         "codec": {"name": "identity"},
         "model": {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1},
         "conditioner": {"name": "adaln"},
+        "objective": {"name": "regression"},
         "data": {"path": str(data), "clip_frames": 13},
     }
     return tiny.make_run(folder, data, parts=parts)

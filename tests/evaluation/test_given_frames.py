@@ -115,6 +115,7 @@ def recurrent(tmp_path_factory, data):
     parts = {
         "codec": {"name": "identity", "temporal_stride": 2},
         "model": {"name": "recurrent", "channels": 8, "width": 16, "blocks": 1},
+        "objective": {"name": "regression"},
         "conditioner": {"name": "adaln"},
     }
     path = tmp_path_factory.mktemp("runs") / "recurrent"

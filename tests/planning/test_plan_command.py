@@ -177,6 +177,7 @@ def test_an_episode_that_fails_does_not_end_the_others(mine, capsys, monkeypatch
 def test_a_planner_that_needs_gradients_is_compared_without_the_simulator(capsys, tmp_path):
     recurrent = {"name": "recurrent", "channels": 8, "width": 8, "blocks": 1}
     parts = {"model": recurrent, "conditioner": {"name": "adaln", "embedding": "stacked"}}
+    parts["objective"] = {"name": "regression"}
     mine = tiny.make_slide_run(tmp_path, parts=parts)
     words = ["plan", mine, "place", "planner=gradient", "planner.iterations=2", "--videos", "0"]
     code, out, err = acwm(capsys, *words, "--compare")

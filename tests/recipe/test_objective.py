@@ -40,6 +40,25 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
     assert objective("+recurrent", "model=dit_xs") == ("diffusion_forcing", SMALL)
 
 
+def test_parameters_given_with_the_model_are_those_of_its_own_objective(tmp_path):
+    wanted = ("regression", {"state_weight": 0.3, "frames": 4})
+    for words in (
+        ["model=recurrent", "objective.frames=4"],
+        ["objective.frames=4", "+recurrent"],
+        ["+recurrent", "+small", "objective.frames=4"],
+    ):
+        assert objective(*words) == wanted
+    mine = tmp_path / "mine.yaml"
+    for first in ("extends: push_cube_small\nmodel: recurrent\n", "extends: small\n"):
+        mine.write_text(f"{first}objective: {{frames: 4}}\n")
+        assert objective(recipe=mine) == wanted
+        assert objective("objective.frames=2", recipe=mine)[1]["frames"] == 2
+        assert objective("model=dit_xs", recipe=mine)[0] == "diffusion_forcing"
+    for name in ("frams", "shift"):
+        with pytest.raises(RecipeError, match=f"Regression has no parameter '{name}'"):
+            objective("+recurrent", f"objective.{name}=4")
+
+
 def test_an_objective_chosen_with_the_model_or_later_stays(tmp_path):
     assert objective("+recurrent", "objective=next_frame")[0] == "next_frame"
     mine = tmp_path / "mine.yaml"
