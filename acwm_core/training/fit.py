@@ -152,8 +152,10 @@ def _start_from(
     except TrainingError as error:
         others = recipe_differences(Recipe.from_yaml(initial.recipe), recipe)
         of_the_model = [each for each in others if each.startswith("model.")]
-        anyway = "training.ignore_mismatched_sizes=true takes what fits"
-        raise TrainingError("; ".join([str(error), *of_the_model, anyway])) from error
+        parts = ("model", "codec", "conditioner")
+        anyway = ["training.ignore_mismatched_sizes=true takes what fits"]
+        anyway = anyway if any(each.startswith(parts) for each in others) else []
+        raise TrainingError("; ".join([str(error), *of_the_model, *anyway])) from error
     return all_training(name, initial)
 
 

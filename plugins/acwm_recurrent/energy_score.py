@@ -32,9 +32,9 @@ class EnergyScore(Regression):
 
     draws = True
 
-    def compared(self, model: Predictor, batch: Batch, known: int) -> Tensor:
+    def picture_loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """The energy score of two draws, a scalar."""
-        only = self.drawn(model, batch, known)
+        only = self.compared_frames(model, batch, known)
         first, true = self.predicted(model, batch, known, only)
         second, _ = self.predicted(model, batch, known, only)
         far = distance(first, true) + distance(second, true)

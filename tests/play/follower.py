@@ -71,7 +71,7 @@ def register():
         catalog().add_plugin(plugin_of(models={"follower": f"{__name__}:Follower"}), "follower")
 
 
-def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
+def make_run(folder, environment="push_cube", model=None, conditioner="raw", objective=None):
     """A run folder with the follower or a fresh model, as training would leave it."""
     register()
     card = catalog().component("environment", environment).load().card
@@ -82,7 +82,7 @@ def make_run(folder, environment="push_cube", model=None, conditioner="raw"):
             "codec": {"name": "identity"},
             "model": model or {"name": "follower"},
             "conditioner": {"name": conditioner},
-            **({} if model else {"objective": {"name": "regression"}}),
+            "objective": {"name": objective or "regression"},
             "data": {"path": "data/none", "clip_frames": 9},
             "evaluation": tiny.METRICS,
         }

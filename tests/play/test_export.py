@@ -189,9 +189,12 @@ def has_runtime():
 def written(tmp_path_factory):
     """The page of a small model: its folder and the model."""
     pytest.importorskip("mujoco", reason="needs the extra rigid")
-    folder = tmp_path_factory.mktemp("export")
-    model = {"name": "recurrent", "channels": 8, "width": 16, "blocks": 1}
-    run = follower.make_run(folder / "run", model=model, conditioner="adaln")
+    return write_page(tmp_path_factory.mktemp("export"))
+
+
+def write_page(folder, objective=None, **parameters):
+    model = {"name": "recurrent", "channels": 8, "width": 16, "blocks": 1, **parameters}
+    run = follower.make_run(folder / "run", model=model, conditioner="adaln", objective=objective)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, "EPISODE_COUNT", 2)
         patch.setattr(episodes, "EPISODE_SECONDS", 1.6)
@@ -259,6 +262,30 @@ def test_the_page_plays_from_a_disk_as_pytorch_does(browser, written):
     worst, rights = replayed(log, world)
     assert worst <= 1  # of 255: rounding
     assert max(rights[-3:]) > 0.7
+
+
+@OLD
+@pytest.mark.slow
+def test_another_draw_in_the_page_is_another_future(browser, tmp_path):
+    if not has_runtime():
+        pytest.skip("needs npm, or ONNX Runtime Web in the cache")
+    folder, _ = write_page(tmp_path, objective="energy_score", noise=6)
+    opened = browser.new_page(viewport=DESK)
+    opened.goto((folder / "index.html").as_uri())
+    opened.wait_for_function("Number(document.body.dataset.alone) > 0", timeout=300_000)
+    opened.evaluate("""() => {
+      window.draws = [];
+      const work = socket.engine.start.bind(socket.engine);
+      socket.engine.start = (...given) => { draws.push(Array.from(given[2])); return work(...given); };
+    }""")
+    for key, number in (("z", 1), ("x", 2), ("z", 3)):  # another draw, the same one, another one
+        opened.keyboard.press(key)
+        opened.wait_for_function(f"draws.length >= {number}", timeout=300_000)
+    assert opened.locator("#redraw").is_visible()
+    first, same, other = opened.evaluate("draws")[:3]
+    opened.close()
+    assert len(first) == 6
+    assert first == same != other
 
 
 def replayed(log, world):

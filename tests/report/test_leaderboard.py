@@ -71,6 +71,10 @@ def test_scores_are_those_of_the_files(folder):
             cell = row.cells[keys.index(f"{split}_{metric}")]
             expected = summary["splits"][split]["scores"]["rows"]["model"][metric]
             assert (cell.value, cell.low, cell.high) == tuple(expected.values())
+            near = summary["splits"]["ind_test"]["scores"]["rows"]["model"][metric]
+            drop = (expected["value"] - near["value"]) * (-1 if metric == "psnr" else 1)
+            allowed = np.hypot(*((each["high"] - each["low"]) / 2 for each in (expected, near)))
+            assert cell.worse == (split == "ood_test" and drop > allowed)
 
 
 def test_broken_files_are_named_and_copies_counted(folder):

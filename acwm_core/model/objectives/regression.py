@@ -51,12 +51,14 @@ class Regression(Objective[Predictor]):
 
     def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """Mean squared error of the latents after the given ones; see `Objective.loss`."""
-        loss = self.compared(model, batch, known)
+        loss = self.picture_loss(model, batch, known)
         return loss if batch.states is None else loss + self.state_weight * model.state_loss(batch)
 
-    def compared(self, model: Predictor, batch: Batch, known: int) -> Tensor:
+    def picture_loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """The loss of the predicted pictures, a scalar."""
-        predicted, true = self.predicted(model, batch, known, self.drawn(model, batch, known))
+        predicted, true = self.predicted(
+            model, batch, known, self.compared_frames(model, batch, known)
+        )
         return functional.mse_loss(predicted.float(), true.float())
 
     def predicted(
@@ -93,7 +95,7 @@ class Regression(Objective[Predictor]):
         """Whether the model has a stream: it was trained to carry its state over the clip."""
         return model.streams
 
-    def drawn(self, model: Predictor, batch: Batch, known: int) -> Tensor | None:
+    def compared_frames(self, model: Predictor, batch: Batch, known: int) -> Tensor | None:
         """The frames of each clip to compare, `[B, N]`; None for all, as in validation.
 
         Raises:

@@ -134,14 +134,14 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
         }
 
 
-def drawn_numbers(world: WorldModel) -> int:
+def noise_size(world: WorldModel) -> int:
     """How many numbers a draw of the model takes; 0 for a model that draws none."""
     return getattr(world.model, "noise", 0)
 
 
 def _draw(world: WorldModel, seed: int) -> tuple[Tensor, ...]:
     """The noise `[1, N]` of a stream with this seed; empty for a model that draws none."""
-    noise = drawn_numbers(world)
+    noise = noise_size(world)
     return (drawn_noise((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
 
 

@@ -20,7 +20,7 @@ from acwm_core.files import made_whole, writing
 from acwm_core.training.run import load_run
 from acwm_play.about import about_world, places
 from acwm_play.export.episodes import EPISODE_COUNT, RecordedEpisode, maps, record
-from acwm_play.export.graphs import check, drawn_numbers, export_graphs
+from acwm_play.export.graphs import check, export_graphs, noise_size
 from acwm_play.export.runtime import runtime
 from acwm_play.layout import Pointing, controls, physics_of
 from acwm_play.live_model import LiveModel
@@ -61,7 +61,7 @@ def export(world: World, folder: Path, package: Path | None = None) -> Path:
         pointing = Pointing.fit(simulator, physics_of(world.environment))
         episodes = [record(simulator, k, live.given, live.stride) for k in range(EPISODE_COUNT)]
         about = _about(world, simulator, live, pointing, episodes)
-        about["noise"] = drawn_numbers(model)
+        about["noise"] = noise_size(model)
     finally:
         simulator.close()
     first, seconds = episodes[0], round(CHECKED_SECONDS * simulator.card.fps / live.stride)
