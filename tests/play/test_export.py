@@ -276,7 +276,10 @@ def test_another_draw_in_the_page_is_another_future(browser, tmp_path):
     opened.evaluate("""() => {
       window.draws = [];
       const work = socket.engine.start.bind(socket.engine);
-      socket.engine.start = (...given) => { draws.push(Array.from(given[2])); return work(...given); };
+      socket.engine.start = (frames, dims, draw) => {
+        draws.push(Array.from(draw));
+        return work(frames, dims, draw);
+      };
     }""")
     for key, number in (("z", 1), ("x", 2), ("z", 3)):  # another draw, the same one, another one
         opened.keyboard.press(key)
