@@ -27,11 +27,15 @@ def compiling(monkeypatch):
     torch._dynamo.reset()
 
 
-def training(parts, **config):
-    """A function that does a training step of a compiled model, by its number."""
+def training(parts, *, compiled=True, **config):
+    """A function that does a training step of a compiled model, by its number.
+
+    It returns the loss and the gradients, which add up.
+    """
+    torch.manual_seed(0)
     module = TrainingModule(
         build_world_model(recipe("", *parts), TinyWorld.card),
-        TrainingConfig(compile=True, **config),
+        TrainingConfig(compile=compiled, **config),
     )
     module.configure_model()
     module.log = lambda *_, **__: None
@@ -47,7 +51,9 @@ def training(parts, **config):
             "actions": torch.rand(2, codec.video_frames(frames), 2),
             "positions": (2 * number, 2 * number + 1),
         }
-        module.training_step(batch, 0).backward()
+        loss = module.training_step(batch, 0)
+        loss.backward()
+        return loss.item(), [p.grad for p in module.parameters() if p.grad is not None]
 
     return step
 
@@ -60,3 +66,23 @@ def test_a_model_is_compiled_once_and_in_one_piece(parts):
         step(number)
     most = 3 if parts[2] == "shortcut" else 1  # one clip and several, without gradients
     assert 1 <= counters["stats"]["unique_graphs"] <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("parts", combinations())
+def test_what_inductor_makes_of_a_model_computes_the_same(parts, monkeypatch):
+    """Losses and gradients of steps with other noise, without compiling again."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="inductor"))
+    made = [step_by_step(training(parts, compiled=compiled)) for compiled in (True, False)]
+    for (loss, gradients), (expected, expected_gradients) in zip(*made, strict=True):
+        assert loss == pytest.approx(expected, rel=1e-4)
+        torch.testing.assert_close(gradients, expected_gradients, rtol=1e-3, atol=1e-5)
+
+
+def step_by_step(step, steps=5):
+    made = []
+    for number in range(steps):
+        torch.manual_seed(number)
+        loss, gradients = step(number)
+        made.append((loss, [gradient.clone() for gradient in gradients]))
+    return made

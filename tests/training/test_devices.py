@@ -243,10 +243,19 @@ def test_a_run_moves_to_other_devices(more_runs, data):
 
 @pytest.mark.slow
 def test_nodes_with_copies_of_shards_train_as_one_device(runs, data, tmp_path):
-    """Two nodes of two processes."""
+    """Two nodes of two processes; also after a SIGTERM that one of the four received."""
+    whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     flags = {"devices": 2, "num_nodes": 2, "strategy": "hsdp"}
-    run = RunFolder(tmp_path / "run")
-    made = {"run": str(run.path), "sections": sections(1, **flags), "resume": None}
-    assert outcomes(data, [made], nodes=2) == [None]
-    assert len(list(run.last_checkpoint.glob("*.distcp"))) == 4
-    assert_close(runs["one"], run)
+    begun = sections(1, **flags, callbacks=[callback("Signal", batch=9, rank=3)])
+    resumed = {"resume": str(stopped.path), "spared": True}
+    jobs = [
+        {"run": str(whole.path), "sections": sections(1, **flags), "resume": None},
+        {"run": str(stopped.path), "sections": begun, "resume": None},
+        {"run": str(stopped.path), "sections": begun, **resumed},
+    ]
+    first, second, third = outcomes(data, jobs, nodes=2)
+    assert (first, third) == (None, None)
+    assert second.startswith("75: stopped by SIGTERM, saved step 10")
+    assert len(list(whole.last_checkpoint.glob("*.distcp"))) == 4
+    assert_close(runs["one"], whole)
+    assert_same(whole, stopped)
