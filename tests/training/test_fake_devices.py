@@ -7,11 +7,13 @@ holds are those of a real training.
 import contextlib
 import multiprocessing
 import os
+from functools import partial
 
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
 from torch import distributed
+from torch._dynamo.utils import counters
 from torch.nn.parallel import DistributedDataParallel
 
 from acwm_core.training import fit as training
@@ -42,8 +44,8 @@ class Facts(Callback):
         self.held = {name: [*local_of(each).shape] for name, each in model.named_parameters()}
 
     def on_train_end(self, trainer, pl_module):
-        clips = trainer.datamodule.clips_per_step
-        self.pipe.send((trainer.global_step, clips, self.places, self.held))
+        clips, graphs = trainer.datamodule.clips_per_step, counters["stats"]["unique_graphs"]
+        self.pipe.send((trainer.global_step, clips, self.places, self.held, graphs))
 
 
 def unchanged(state, bucket):
@@ -57,7 +59,7 @@ def local_of(tensor):
     return tensor.to_local() if hasattr(tensor, "to_local") else tensor
 
 
-def _train(pipe, data, folder, strategy, world, rank):
+def _train(pipe, data, folder, strategy, world, compiled, rank):
     from torch.testing._internal.distributed.fake_pg import FakeStore
 
     nodes, node = world // NODE, rank // NODE
@@ -71,6 +73,8 @@ def _train(pipe, data, folder, strategy, world, rank):
     distributed.broadcast_object_list = lambda *_, **__: None
     distributed.new_group = lambda *_, **__: distributed.group.WORLD
     training.first_decides = contextlib.nullcontext  # nobody else is there to hear it
+    # In one piece or not at all, and without the minutes that a fast program takes.
+    torch.compile = partial(torch.compile, fullgraph=True, backend="aot_eager")
     Facts.pipe = pipe
     flags = {"devices": NODE, "num_nodes": nodes, "strategy": strategy, "max_steps": STEPS}
     flags |= {"enable_checkpointing": False, "accumulate_grad_batches": 2, "precision": "32-true"}
@@ -80,7 +84,7 @@ def _train(pipe, data, folder, strategy, world, rank):
             data,
             model={"width": 36, "depth": 1},
             data={"batch_size": 2},
-            training={"validate_every_n_steps": 100},
+            training={"validate_every_n_steps": 100, "compile": compiled},
             trainer=flags,
         ),
         folder,
@@ -107,21 +111,26 @@ def part(rows, parts, number):
 
 
 @pytest.mark.parametrize(
-    ("strategy", "world", "ranks", "parts"),
+    ("strategy", "world", "compiled", "ranks", "parts"),
     [
-        ("ddp", 8, (0, 5), 1),
-        ("ddp", 64, (63,), 1),
-        ("fsdp", 8, (0, 7), 8),
-        ("fsdp", 64, (0, 41), 64),
-        ("hsdp", 8, (3,), 8),
-        ("hsdp", 64, (0, 41), 8),
+        ("ddp", 8, False, (0, 5), 1),
+        ("ddp", 64, False, (63,), 1),
+        ("fsdp", 8, False, (0, 7), 8),
+        ("fsdp", 64, False, (0, 41), 64),
+        ("hsdp", 8, False, (3,), 8),
+        ("hsdp", 64, False, (0, 41), 8),
+        ("ddp", 8, True, (5,), 1),
+        ("fsdp", 64, True, (41,), 64),
+        ("hsdp", 64, True, (41,), 8),
     ],
 )
-def test_every_process_takes_its_part(strategy, world, ranks, parts, data, tmp_path):
-    """Of the clips of each step, and of the weights; all do as many steps."""
+def test_every_process_takes_its_part(strategy, world, compiled, ranks, parts, data, tmp_path):
+    """Of the clips of each step, and of the weights; all do as many steps. Compiled, too."""
     for rank in ranks:
         run = tmp_path / f"{rank}"
-        steps, clips, places, held = of_rank(data, run, strategy, world, rank)
+        job = strategy, world, compiled, rank
+        steps, clips, places, held, graphs = of_rank(data, run, *job)
+        assert graphs == (1 if compiled else 0)
         assert steps == STEPS
         assert clips == 2 * 2 * world
         batches = [
