@@ -15,7 +15,7 @@ from acwm_core.model.objectives.regression import Regression
 from acwm_recurrent.energy_score import EnergyScore, distance
 from acwm_recurrent.recurrent import RecurrentModel
 
-SMALL = {"channels": 8, "width": 16, "blocks": 1}
+SMALL = {"channels": 16, "width": 64, "blocks": 1}
 COIN = 0.7
 """How often the coin of `tossed` shows +1."""
 
@@ -27,7 +27,7 @@ def tossed(clips, seed):
     latents = coins[:, None, None, None, None].repeat(1, 4, 1, 4, 4)
     latents[:, 0] = 0
     numbers = [torch.Generator().manual_seed(seed + clip) for clip in range(clips)]
-    return Batch(latents, Conditioning(torch.zeros(clips, 4, 16), None, None), numbers)
+    return Batch(latents, Conditioning(torch.zeros(clips, 4, SMALL["width"]), None, None), numbers)
 
 
 def trained(model, objective, steps=250):
@@ -51,12 +51,11 @@ def drawn(model, objective, clips=400):
 
 def test_draws_fall_where_futures_do_as_often_and_stay_there():
     torch.manual_seed(0)
-    model = RecurrentModel(latent_channels=1, noise=4, **SMALL)
+    model = RecurrentModel(latent_channels=1, noise=1, **SMALL)  # one coin, one number
     objective = EnergyScore()
     seen = drawn(trained(model, objective), objective)
-    # Six initialisations gave .66 to .98, .93 to 1 and .66 to .72; the mean frame gives 0 and 1.
-    assert np.mean(np.abs(seen) > 0.5) > 0.5
-    assert np.mean(np.sign(seen) == np.sign(seen[:, :1])) > 0.9  # a draw does not change its mind
+    assert np.mean(np.abs(np.abs(seen) - 1) < 0.2) > 0.9
+    assert np.mean(np.sign(seen) == np.sign(seen[:, :1])) > 0.99  # a draw does not change its mind
     assert np.mean(seen > 0) == pytest.approx(COIN, abs=0.1)
     torch.manual_seed(0)
     mean = trained(RecurrentModel(latent_channels=1, **SMALL), Regression())
@@ -98,7 +97,7 @@ def test_a_draw_is_taken_by_agent_and_stream_alike():
     model = RecurrentModel(latent_channels=3, state_size=4, noise=5, **SMALL).eval()
     for parameter in model.parameters():
         nn.init.normal_(parameter, std=0.2)
-    given, modulation = torch.randn(2, 1, 3, 8, 8), torch.randn(2, 4, 16)
+    given, modulation = torch.randn(2, 1, 3, 8, 8), torch.randn(2, 4, SMALL["width"])
 
     def numbers():
         return [torch.Generator().manual_seed(clip) for clip in range(2)]
