@@ -75,6 +75,26 @@ class CodecChecks(Suite):
         expect_equal("one by one they decode to", [*single.shape], [*together.shape])
         _expect_same(single, together, "pixels differ by {} if latent frames come one by one")
 
+    def a_reference_belongs_to_its_video(self) -> None:
+        """Decode every video with its own reference, one by one too; latents do not depend on it.
+
+        Only of a codec that decodes with a reference.
+        """
+        video = self._clip(batch=2)
+        latents, codec = self._codec.encode(video), self._codec.with_reference(video[:, 0])
+        if codec is self._codec:
+            raise NotTried("it decodes latents alone")
+        _expect_same(codec.encode(video), latents, "latents change by {} with a reference")
+        together = codec.decode(latents)
+        expect_equal("video comes back", [*together.shape], [*video.shape])
+        alone = self._codec.with_reference(video[1:, 0]).decode(latents[1:])
+        _expect_same(together[1:], alone, "pixels change by {} with the rest of the batch")
+        shared = self._codec.with_reference(video[:1, 0]).decode(latents)
+        _expect_same(together[:1], shared[:1], "pixels differ by {} if all share a reference")
+        decode = codec.frame_decoder()
+        single = torch.cat([decode(latents[:, i : i + 1]) for i in range(latents.shape[1])], 1)
+        _expect_same(single, together, "pixels differ by {} if latent frames come one by one")
+
     def encoding_is_causal(self) -> None:
         """Encode a prefix of the video to the prefix of the latents."""
         codec, video = self._codec, self._clip()

@@ -48,7 +48,7 @@ class LatentFolder:
     """The folder of the latents of a split's windows, with one file per shard."""
 
     episodes: EpisodeDataset  # the split
-    fingerprint: str  # of the codec, `Codec.fingerprint()`
+    fingerprint: str  # `Codec.latents_fingerprint()`
     frames: int  # frames of a window
     stride: int  # frames between the starts of an episode's windows
     symmetry: Symmetry | None = None  # transforms the windows before they are encoded
@@ -137,7 +137,7 @@ def encode_windows(
             codec; or the codec returned values that float16 cannot hold.
         ShapeError: the codec cannot encode frames of this size.
     """
-    folder = LatentFolder(episodes, codec.fingerprint(), frames, stride, symmetry)
+    folder = LatentFolder(episodes, codec.latents_fingerprint(), frames, stride, symmetry)
     with writing(folder.path), contextlib.ExitStack() as stack:
         folder.path.mkdir(parents=True, exist_ok=True)
         folder.keep_card()
@@ -213,7 +213,7 @@ class LatentClipDataset(Clips):
 
     Args:
         episodes: the split they come from.
-        fingerprint: of the codec, `Codec.fingerprint()`.
+        fingerprint: `Codec.latents_fingerprint()`.
         temporal_stride: as in `Clips`.
         windows: `frames` and `stride`, as they were encoded, and `indices`, `given`, `per_length`,
             `symmetries` and `states`, as in `Clips`.

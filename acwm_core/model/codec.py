@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError, ShapeError, check_shape
-from acwm_core.model.shapes import Latent, Video
+from acwm_core.model.shapes import Frame, Latent, Video
 
 FrameDecoder = Callable[[Latent], Video]
 """Maps the next latent frames `[B, k, C, h, w]` to their video frames."""
@@ -48,7 +48,14 @@ class Codec(nn.Module, ABC):
 
     @abstractmethod
     def fingerprint(self) -> str:
-        """A short hash of configuration and weights; equal fingerprints mean equal latents."""
+        """A short hash of configuration and weights, of encoder and decoder."""
+
+    def latents_fingerprint(self) -> str:
+        """Names the latents: equal for codecs with equal latents, so that models fit them all.
+
+        That of all weights, unless a codec knows that it shares its latents with another.
+        """
+        return self.fingerprint()
 
     def encode(self, video: Video) -> Latent:
         """Encode `[B, T, 3, H, W]` to `[B, L, C, h, w]`, L = `latent_frames(T)`.
@@ -87,6 +94,18 @@ class Codec(nn.Module, ABC):
         check_shape(self, "_decode", video, len(latents), decodable, 3, *sides)
         return video[:, :frames].float().clamp(0, 1)
 
+    def with_reference(self, frame: Frame) -> Codec:
+        """This codec, as it decodes what follows a known frame `[B, 3, H, W]` in [0, 1].
+
+        A model predicts what follows frames that it was given, so a decoder may take from the last
+        of them what does not move. Such a codec overrides this method. Most codecs decode latents
+        alone, and return themselves.
+
+        Args:
+            frame: one per video to decode, or one for all.
+        """
+        return self
+
     def latent_frames(self, frames: int) -> int:
         """Number L of latent frames that encode `frames` video frames."""
         return 1 + -(-(frames - 1) // self.temporal_stride)
@@ -100,8 +119,12 @@ class Codec(nn.Module, ABC):
         return height // self.spatial_stride, width // self.spatial_stride
 
     def forward(self, video: Video) -> Video:
-        """Encode and decode a video: its reconstruction, of the same length."""
-        return self.decode(self.encode(video), frames=video.shape[1])
+        """Encode and decode a video: its reconstruction, of the same length.
+
+        It is decoded as a rollout from its first frame is: with that frame as the reference.
+        """
+        latents = self.encode(video)
+        return self.with_reference(video[:, 0]).decode(latents, frames=video.shape[1])
 
     def frame_decoder(self) -> FrameDecoder:
         """Return a decoder that takes the latent frames of a video one by one, in constant memory.

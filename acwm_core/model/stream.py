@@ -64,7 +64,7 @@ class Stream:
             self._latents = world.objective.stream(
                 world.model, latents, generators, steps=steps, context=context
             )
-            self._decode = world.codec.frame_decoder()
+            self._decode = world.codec.with_reference(given[:, -1]).frame_decoder()
             self.given = self._decode(latents)
         self.first, self._untold = self.given[:, 0], latents.shape[1]
         if world.conditioner.history is None:

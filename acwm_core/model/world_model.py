@@ -225,8 +225,11 @@ class WorldModel(nn.Module):
             yield stream.given
             yield from stream.play(actions[:, known - 1 : -1], DECODED_TOGETHER, check=False)
             return
+        codec = self.codec.with_reference(video[:, -1])
         for start in range(0, max(frames - known, 1), window - known):
-            chunk = self._predict(video, actions[:, start : start + window], steps, generators)
+            rows = actions[:, start : start + window]
+            latents = self._predict(video, rows, steps, generators)
+            chunk = codec.decode(latents, frames=rows.shape[1])
             video = chunk[:, -known:]
             yield chunk if start == 0 else chunk[:, known:]
 
@@ -276,22 +279,41 @@ class WorldModel(nn.Module):
             )
         return video
 
+    @torch.no_grad()
+    def predict_latents(
+        self,
+        given: Frame | Video,
+        actions: Actions,
+        *,
+        steps: int | None = None,
+        seeds: Sequence[int] | None = None,
+    ) -> Latent:
+        """Predict latents `[B, L, C, h, w]`, the given frames' first, in one window.
+
+        Args:
+            given: the first frames, as for `rollout_chunks`.
+            actions: raw actions `[B, T, A]` of all frames.
+            steps: network evaluations; the model's default if None.
+            seeds: one per batch element; 0, 1, … by default.
+        """
+        video = self._given(given)
+        return self._predict(video, actions, steps, _generators(video, len(actions), seeds))
+
     def _predict(
         self,
         given: Video,
         actions: Actions,
         steps: int | None,
         generators: Sequence[torch.Generator],
-    ) -> Video:
-        """Predict one window, with as many frames as there are action rows."""
-        frames = actions.shape[1]
-        latents, length = self.codec.encode(given), self.codec.latent_frames(frames)
+    ) -> Latent:
+        """Predict the latents of one window, with as many frames as there are action rows."""
+        latents, length = self.codec.encode(given), self.codec.latent_frames(actions.shape[1])
         rows = self._prepare(actions, length)
         conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
             begin = Batch(latents, conditioning, generators)
             latents = self.objective.predict(self.model, begin, length, steps)
-        return self.codec.decode(latents, frames=frames)
+        return latents
 
     def checked(self, actions: Actions) -> Actions:
         """Check a user's raw actions `[B, T, A]` and return them unchanged.

@@ -138,7 +138,7 @@ class SavedWeights(Callback):
                     weights[name.removeprefix("averaged.")] = whole.cpu()
         if trainer.is_global_zero:
             # The codec is frozen, and hashing a large one takes longer than writing the file.
-            self._codec = self._codec or pl_module.world_model.codec.fingerprint()
+            self._codec = self._codec or pl_module.world_model.codec.latents_fingerprint()
             save_weights(self._run.weights, weights, self._codec, step=checkpoint["global_step"])
 
 

@@ -212,4 +212,4 @@ class ClipData(L.LightningDataModule):
         }
         if not cached:
             return ClipDataset(self.episodes, **windows)
-        return LatentClipDataset(self.episodes, self.codec.fingerprint(), **windows)
+        return LatentClipDataset(self.episodes, self.codec.latents_fingerprint(), **windows)

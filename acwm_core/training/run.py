@@ -73,7 +73,7 @@ def save_weights(
     Args:
         path: the ``.safetensors`` file.
         weights: state dict of a `WorldModel`; only model and conditioner are kept.
-        codec: fingerprint of the codec whose latents the weights expect, so that no other is used
+        codec: fingerprint of the latents that the weights expect, so that no other is used
             with them. None if it is unknown; then the codec of the recipe is trusted.
         step: number of optimiser steps of the weights.
         **details: further JSON-ready facts for the metadata.
@@ -119,10 +119,11 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
         DataError: its weights are not finite.
     """
     facts = read_metadata(path)
-    if facts["codec"] not in (None, world_model.codec.fingerprint()):
+    own = world_model.codec.latents_fingerprint()
+    if facts["codec"] not in (None, own):
         raise TrainingError(
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
-            f"{world_model.codec.fingerprint()}): restore that codec or train again"
+            f"{own}): restore that codec or train again"
         )
     weights, expected = _stored(path, facts), _trained(world_model)
     for name in sorted({*weights, *expected}):

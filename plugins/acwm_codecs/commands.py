@@ -1,4 +1,4 @@
-"""`acwm train-codec`: train the codec `compact` or `fine` on your own data."""
+"""`acwm train-codec`: train a codec, or its decoder, on your own data."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.arguments import DATASET, OUT_FILE
+from acwm_core.cli.arguments import DATASET, OUT_FILE, RUN
 
 
 @click.command("train-codec")
@@ -15,7 +15,7 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
 @click.option(
     "--codec",
     default="compact",
-    type=click.Choice(["compact", "fine"]),
+    type=click.Choice(["compact", "fine", "compact_reference"]),
     help="Which codec.  [default: compact]",
 )
 @click.option(
@@ -23,6 +23,19 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE
     help="Initial weights: a file, random, or the codec's name, for those that ship (default).",
 )
 @click.option("--decoder-only", is_flag=True, help="Keep the encoder, and so the latents.")
+@click.option(
+    "--predicted-by",
+    type=RUN,
+    multiple=True,
+    metavar="RUN",
+    help="Train the decoder on what this model predicts of DATA, too; for several models of "
+    "several worlds.",
+)
+@click.option(
+    "--freeze-coarse",
+    is_flag=True,
+    help="Train only the finer layers of the decoder of compact_reference: OUT has 3 MB, not 7.",
+)
 @click.option("--steps", default=2000, type=click.IntRange(1), help="Optimiser steps.")
 @click.option("--batch", default=32, type=click.IntRange(1), help="Groups of frames per step.")
 @click.option(

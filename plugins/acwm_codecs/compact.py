@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from acwm_core.errors import DataError
 from acwm_core.model.codec import Codec
-from acwm_core.model.shapes import Latent, Video, check_finite
+from acwm_core.model.shapes import Frame, Latent, Video, check_finite
 
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -93,24 +93,39 @@ class Compact(Codec):
 
     def __init__(self, *, weights: str | None = None) -> None:
         super().__init__()
+        self._make_layers()
+        if weights != "random":
+            self._load(Path(weights) if weights else self.shipped_weights())
+            self.eval()  # normalise with trained statistics, not with those of the batch
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def _make_layers(self) -> None:
+        """Make the layers, whose weights are loaded afterwards."""
         self.encoder = make_encoder(self.widths, self.channels)
         self.decoder = make_decoder(self.widths, self.channels)
         # Without affine parameters its running statistics are the latent's mean and variance:
         # normalisation is learned during training and fixed in evaluation.
         self.normalise = nn.BatchNorm2d(self.channels, affine=False)
-        if weights != "random":
-            self._load(Path(weights) if weights else self.shipped_weights())
-            self.eval()  # normalise with trained statistics, not with those of the batch
-        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @classmethod
     def shipped_weights(cls) -> Path:
         """The file of the weights that ship."""
         return WEIGHTS / f"{cls.name}.safetensors"
 
+    def stored(self) -> dict[str, Tensor]:
+        """The weights as files have them, in half precision."""
+        return {
+            name: value.half().contiguous() if value.is_floating_point() else value
+            for name, value in self.state_dict().items()
+        }
+
+    def _read(self, path: Path) -> dict[str, Tensor]:
+        """All weights that a file stands for."""
+        return load_file(path)
+
     def _load(self, path: Path) -> None:
         try:
-            state = load_file(path)
+            state = self._read(path)
             self.load_state_dict({name: value.float() for name, value in state.items()})
         except FileNotFoundError:
             raise DataError(f"codec '{self.name}': there is no weights file {path}") from None
@@ -132,8 +147,16 @@ class Compact(Codec):
 
     def _groups(self, latents: Latent) -> Tensor:
         """Decode `[B, L, C, h, w]` to `[B, L, 12, H, W]` in [0, 1]."""
-        groups = self.decoder(latents.flatten(0, 1)).float()
-        return groups.unflatten(0, latents.shape[:2]) / 2 + 0.5
+        return self.decode_groups(latents.flatten(0, 1)).unflatten(0, latents.shape[:2])
+
+    def decode_groups(self, latents: Tensor, reference: Frame | None = None) -> Tensor:
+        """Decode latent frames `[N, C, h, w]` to groups of four frames `[N, 12, H, W]` in [0, 1].
+
+        Args:
+            latents: latent frames.
+            reference: a frame before each, `[N, 3, H, W]` in [0, 1]; not looked at here.
+        """
+        return self.decoder(latents).float() / 2 + 0.5
 
     def fingerprint(self) -> str:
         digest = hashlib.sha256(self.name.encode())

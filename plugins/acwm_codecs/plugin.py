@@ -7,11 +7,11 @@ _NEEDS = {"extra": "codecs", "requires": ("diffusers", "huggingface_hub")}
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add the command that trains `compact` and `fine`."""
+    """Add the command that trains the codecs whose weights ship."""
     registry.add(
         "train-codec",
         "acwm_codecs.commands:train_codec",
-        summary="train the codec compact or fine on your own data",
+        summary="train a codec, or its decoder, on your own data",
     )
 
 
@@ -26,30 +26,24 @@ def register_codecs(registry: Registry) -> None:
     fine = "the same at half its stride, for small objects: strides 4×4×4, 16 channels"
     registry.add("fine", "acwm_codecs.compact:Fine", summary=fine)
     registry.add(
+        "compact_reference",
+        "acwm_codecs.compact_reference:CompactReference",
+        summary="the latents of compact, decoded with the given frame: what stands still is kept",
+    )
+    registry.add(
         "compact_per_frame",
         "acwm_codecs.compact_per_frame:CompactPerFrame",
         summary="the same weights with every frame by itself: strides 8×8, 16 channels",
     )
     lossless = "lossless: folds blocks of pixels and frames into channels, nothing learned"
     registry.add("identity", "acwm_codecs.identity:Identity", summary=lossless)
-    registry.add(
-        "wan",
-        "acwm_codecs.wan:Wan",
-        summary="the video autoencoder of Wan 2.1: strides 8×8×4, 16 channels, 127 M parameters",
-        **_NEEDS,
-    )
-    registry.add(
-        "wan_per_frame",
-        "acwm_codecs.wan:WanPerFrame",
-        summary="the same with every frame by itself: strides 8×8, 16 channels",
-        **_NEEDS,
-    )
-    registry.add(
-        "flux",
-        "acwm_codecs.flux:Flux",
-        summary="the image autoencoder of FLUX.1, frame by frame: strides 8×8, 16 channels",
-        **_NEEDS,
-    )
+    wan = "the video autoencoder of Wan 2.1: strides 8×8×4, 127 M parameters"
+    for name, target, summary in (
+        ("wan", "wan:Wan", wan),
+        ("wan_per_frame", "wan:WanPerFrame", "the same with every frame by itself: strides 8×8"),
+        ("flux", "flux:Flux", "the image autoencoder of FLUX.1, frame by frame: strides 8×8"),
+    ):
+        registry.add(name, f"acwm_codecs.{target}", summary=f"{summary}, 16 channels", **_NEEDS)
     for name, target, what in (
         ("autoencoder_kl", "KL", "AutoencoderKL, as of Stable Diffusion"),
         ("autoencoder_tiny", "Tiny", "AutoencoderTiny, as of TAESD"),

@@ -1,10 +1,13 @@
-"""Trains `Compact` and `Fine` (`acwm train-codec`).
+"""Trains `Compact`, `Fine` and `CompactReference` (`acwm train-codec`).
 
 Every step uses random groups of four consecutive frames, cropped to 64×64, from all datasets with
 equal probability. Some are mirrored and have permuted colour channels, so that the codec also works
 on unseen scenes. Latents are made noisy and some of their cells are emptied, so that the decoder
 bears the errors of a dynamics model. What moves, edges and the worst place of a group count for
 more than the rest: small objects are a few pixels.
+
+A decoder can also learn from latents as a model predicts them (`--predicted-by`), which are wrong
+in other ways than noisy ones.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +27,23 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from acwm_codecs.compact import STRIDE, Compact, Fine
-from acwm_codecs.frame_groups import Videos, load_videos, sample_groups
+from acwm_codecs.compact_reference import CompactReference
+from acwm_codecs.frame_groups import Groups, Source, load_videos, sample_groups
+from acwm_codecs.predicted import Predictions
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_core.files import load_plain, training_record, written_whole
 from acwm_core.model.shapes import check_finite
 
-CODECS: dict[str, type[Compact]] = {codec.name: codec for codec in (Compact, Fine)}
+CODECS: dict[str, type[Compact]] = {
+    codec.name: codec for codec in (Compact, Fine, CompactReference)
+}
 """The codecs that can be trained."""
 
 LATENT_NOISE = 0.05
 EMPTY_FRACTION = 0.01  # cells of latents that are set to zero
+WITHOUT_REFERENCE = 0.1  # steps in which a decoder that can see a reference sees none
 DETAIL_WEIGHT = 0.5
 WORST_WEIGHT = 0.02
 WORST_CELL = 8  # side of a cell, in pixels
@@ -49,7 +57,7 @@ CLIPPED_AT = 2.0  # gradients above this many running norms are clipped
 
 
 @torch.no_grad()
-def measure_latents(codec: Compact, sources: Sequence[Videos], batch: int, seed: int) -> None:
+def measure_latents(codec: Compact, sources: Sequence[Source], batch: int, seed: int) -> None:
     """Measure the mean and variance for `normalise` on random groups, and fix them.
 
     With statistics of the current batch, the decoder would only learn the brightness of a frame
@@ -59,32 +67,41 @@ def measure_latents(codec: Compact, sources: Sequence[Videos], batch: int, seed:
     codec.normalise.reset_running_stats()
     codec.normalise.train().momentum = None  # an average over all batches
     for _ in range(MEASURED_BATCHES):
-        groups, _ = sample_groups(sources, batch, rng)
+        groups = sample_groups(sources, batch, rng)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            codec.normalise(codec.encoder(groups * 2 - 1))
+            codec.normalise(codec.encoder(groups.frames * 2 - 1))
     codec.normalise.eval()
 
 
 def losses(
-    codec: Compact, groups: Tensor, generator: torch.Generator
+    codec: Compact, groups: Groups, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The losses of a reconstruction from noisy latents.
+    """The losses of a reconstruction from noisy latents, or from those that a model predicts.
 
     Returns:
         The loss `[N]` and the mean squared error `[N]` of each group, and how far the latents' mean
         and variance are from 0 and 1. Without the last, latents would grow until the noise is
         negligible.
     """
+    frames, reference = groups.frames, groups.references
+    if torch.rand((), generator=generator) < WITHOUT_REFERENCE:
+        reference = None
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        latents = codec.normalise(codec.encoder(groups * 2 - 1))
+        latents = codec.normalise(codec.encoder(frames[~groups.predicted] * 2 - 1))
         noise = torch.randn(latents.shape, generator=generator)
         kept = torch.rand(latents[:, :1].shape, generator=generator) >= EMPTY_FRACTION
-        decoded = codec.decoder((latents + LATENT_NOISE * noise) * kept)
-    squared = (decoded.float() / 2 + 0.5 - groups).square()
+        seen = (latents + LATENT_NOISE * noise) * kept
+        if len(groups.latents):
+            own, seen = seen, seen.new_empty(len(frames), *seen.shape[1:])
+            seen[~groups.predicted], seen[groups.predicted] = own, groups.latents.to(own)
+        decoded = codec.decode_groups(seen, reference)
+    squared = (decoded - frames).square()
     worst = functional.avg_pool2d(squared, WORST_CELL).mean(1).amax((1, 2))
-    weighted = (squared * detail_weights(groups)).mean((1, 2, 3))
-    variance, mean = torch.var_mean(latents.float(), (0, 2, 3))
-    spread = (mean.square() + (variance - 1).square()).mean()
+    weighted = (squared * detail_weights(frames)).mean((1, 2, 3))
+    spread = squared.new_zeros(())
+    if len(latents):
+        variance, mean = torch.var_mean(latents.float(), (0, 2, 3))
+        spread = (mean.square() + (variance - 1).square()).mean()
     return weighted + WORST_WEIGHT * worst, squared.mean((1, 2, 3)), spread
 
 
@@ -147,7 +164,7 @@ class Training:
 
     Args:
         codec: the codec, trained in place.
-        sources: videos of each dataset.
+        sources: the datasets.
         decoder_only: keep the encoder and the statistics of its latents as they are.
         batch: groups per step.
         seed: seed of the groups and of the noise.
@@ -156,7 +173,7 @@ class Training:
     def __init__(
         self,
         codec: Compact,
-        sources: Sequence[Videos],
+        sources: Sequence[Source],
         *,
         batch: int,
         seed: int,
@@ -182,15 +199,20 @@ class Training:
             self.step += 1
             for group in self._optimizer.param_groups:
                 group["lr"] = learning_rate(self.step, steps, peak, decay)
-            groups, chosen = sample_groups(self.sources, self.batch, self._rng)
+            groups = sample_groups(self.sources, self.batch, self._rng)
             each, errors, spread = losses(self.codec, groups, self._noise)
-            weights = self.running.update(errors.detach(), chosen)
+            weights = self.running.update(errors.detach(), groups.sources)
             loss = (each * weights).sum() + SPREAD_WEIGHT * spread
             self._optimizer.zero_grad()
             loss.backward()
             self._clip()
             self._optimizer.step()
             yield self.step
+
+    def told(self, names: Sequence[str]) -> str:
+        """The PSNR of each source, beside its name."""
+        decibels = zip(names, self.running.decibels(), strict=True)
+        return " ".join(f"{name} {value:.1f}" for name, value in decibels)
 
     def _clip(self) -> None:
         """Clip the gradient relative to those before, as a rare one would undo a training."""
@@ -241,6 +263,8 @@ def train_on(
     codec: str,
     start: str,
     decoder_only: bool,
+    predicted_by: Sequence[Path],
+    freeze_coarse: bool,
     steps: int,
     batch: int,
     peak: float,
@@ -254,18 +278,21 @@ def train_on(
     Raises:
         DataError: the data, the initial weights or the name of the file are unsuitable.
     """
-    if out.suffix != ".safetensors":
-        raise DataError(f"--out {out} must end in .safetensors, as that is what it will be")
-    if decoder_only and start == "random":
-        raise DataError("--decoder-only keeps an encoder, so it cannot --start random")
+    decoder_only = decoder_only or bool(predicted_by) or freeze_coarse
+    _check_asked(out, start, decoder_only)
     kind = CODECS[codec]
-    file = kind.shipped_weights() if start == codec else Path(start)
-    loaded = {folder: load_videos(folder, episodes) for folder in data}
-    sources = [loaded[folder] for folder in data]
+    file = CODECS[start].shipped_weights() if start in CODECS else Path(start)
     if threads:
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    trained = kind(weights=start if start == "random" else str(file)).train()
+    trained = begun(kind, start, file)
+    if freeze_coarse:
+        _freeze_coarse(trained)
+    predictions = Predictions(predicted_by, trained)
+    loaded = {
+        folder: Source(load_videos(folder, episodes), predictions.of(folder, episodes))
+        for folder in dict.fromkeys(data)
+    }
     record = {
         "codec": codec,
         "data": [provenance(folder, episodes) for folder in data],
@@ -276,10 +303,13 @@ def train_on(
         "start": start if start == "random" else training_record(file),
         "of_steps": steps,
         **({"decoder_only": True} if decoder_only else {}),
+        **({"predicted_by": predictions.record()} if predicted_by else {}),
+        **({"freeze_coarse": True} if freeze_coarse else {}),
     }
     started = start != "random"
     before = {folder: reconstruction(trained, folder) for folder in loaded if started}
-    training = Training(trained, sources, batch=batch, seed=seed, decoder_only=decoder_only)
+    sources = [loaded[folder] for folder in data]
+    training = Training(trained.train(), sources, batch=batch, seed=seed, decoder_only=decoder_only)
     state = out.with_suffix(".training")
     if state.exists():
         training.restore(state, record)
@@ -288,16 +318,51 @@ def train_on(
         if step % 100 == 0 or step == steps:
             save(trained, out, {**record, "steps": step})
             training.store(state, record)
-            decibels = zip(names, training.running.decibels(), strict=True)
-            psnr = " ".join(f"{name} {value:.1f}" for name, value in decibels)
-            click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {psnr}")
+            click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {training.told(names)}")
     state.unlink(missing_ok=True)
-    for folder in loaded:
-        now, old = reconstruction(kind(weights=str(out)), folder), before.get(folder)
+    tell_gain(kind(weights=str(out)), loaded, before)
+    click.echo(f"{out}; use it by codec={codec} codec.weights={out}")
+
+
+def _check_asked(out: Path, start: str, decoder_only: bool) -> None:
+    if out.suffix != ".safetensors":
+        raise DataError(f"--out {out} must end in .safetensors, as that is what it will be")
+    if decoder_only and start == "random":
+        raise DataError(
+            "--decoder-only, --predicted-by and --freeze-coarse keep an encoder: not --start random"
+        )
+
+
+def tell_gain(codec: Compact, folders: Iterable[Path], before: Mapping[Path, float | None]) -> None:
+    """Print the reconstruction of test episodes, and what it was before."""
+    for folder in folders:
+        now, old = reconstruction(codec, folder), before.get(folder)
         if now is not None:
             gain = "" if old is None else f"{old:.2f} dB before and "
             click.echo(f"{folder}: {gain}{now:.2f} dB now, on test episodes")
-    click.echo(f"{out}; use it by codec={codec} codec.weights={out}")
+
+
+def begun(kind: type[Compact], start: str, file: Path) -> Compact:
+    """The codec to train, in evaluation mode: `random`, from a file or from another codec.
+
+    The weights that ship with `compact` fit into `compact_reference`, but for what it lacks.
+    """
+    if start not in CODECS or start == kind.name:
+        return kind(weights=start if start == "random" else str(file)).eval()
+    trained = kind(weights="random").eval()
+    try:
+        found = trained.load_state_dict(CODECS[start]().state_dict(), strict=False)
+    except RuntimeError:  # sizes differ
+        found = None
+    if found is None or found.unexpected_keys:
+        raise DataError(f"the weights of {start} do not fit into {kind.name}: leave out --start")
+    return trained
+
+
+def _freeze_coarse(codec: Compact) -> None:
+    if not isinstance(codec, CompactReference):
+        raise DataError(f"--freeze-coarse goes with --codec compact_reference, not {codec.name}")
+    codec.freeze_coarse()
 
 
 @torch.no_grad()
@@ -323,10 +388,7 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
 
 def save(codec: Compact, out: Path, record: dict[str, Any]) -> None:
     """Write the weights as float16, with a record of how they were made."""
-    state = {
-        name: value.half().contiguous() if value.is_floating_point() else value
-        for name, value in codec.state_dict().items()
-    }
+    state = codec.stored()
     check_finite(out, state)
     out.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(out) as partial:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -65,7 +66,7 @@ class ModelFutures(Futures):
     """The futures that a model predicts for candidates.
 
     Args:
-        codec: codec of the latents.
+        codec: codec of the latents, which knows the current frame.
         latents: predicted latents after `before`, `[N, L, C, h, w]`.
         before: the latent frames up to now, `[N, K, C, h, w]`.
         last: index, within the last latent frame, of the last planned video frame.
@@ -141,6 +142,19 @@ class ModelFutures(Futures):
         return latent
 
 
+class _Given(NamedTuple):
+    """What a decision knows: the codec with the last given frame, latents and actions up to now."""
+
+    codec: Codec
+    latents: Latent
+    actions: Tensor
+
+    @property
+    def frames(self) -> int:
+        """Number of video frames from the first given one to the current one."""
+        return 1 + self.actions.shape[1]
+
+
 class ModelRollouts:
     """Predicts the futures of candidates with a model.
 
@@ -184,13 +198,13 @@ class ModelRollouts:
             goal_cost: cost of the candidates' futures.
             seed: seed of the model's noise.
         """
-        given, recent = self._encode(history, still)
+        given = self._given(history, still)
         stills: list[tuple[Frame, Latent]] = []
 
         def cost(actions: Actions) -> Tensor:
             costs: list[Tensor] = []
             for part in actions.split(self._batch):
-                futures = self._futures(given, recent, part, seed, stills)
+                futures = self._futures(given, part, seed, stills)
                 # An estimator may read something from a picture that is not finite.
                 finite, readable = futures.finite.cpu(), goal_cost(futures, len(part)).cpu()
                 costs.append(torch.where(finite, readable, torch.nan))
@@ -203,13 +217,12 @@ class ModelRollouts:
         self, history: History, still: NDArray[np.float32], actions: Tensor, seed: int
     ) -> Clip:
         """Predict the video `[T, 3, H, W]` of one candidate `[T, A]`."""
-        given, recent = self._encode(history, still)
-        latents = self._predict(given, recent, actions[None], seed)
-        frames = self.world_model.codec.decode(latents)[0]
-        return frames[self._known_frames(recent) :][: len(actions)].cpu()
+        given = self._given(history, still)
+        latents = self._predict(given, actions[None], seed)
+        frames = given.codec.decode(latents)[0]
+        return frames[given.frames :][: len(actions)].cpu()
 
-    def _encode(self, history: History, still: NDArray[np.float32]) -> tuple[Latent, Tensor]:
-        """Latents of the given frames `[1, K, C, h, w]`, and the actions `[1, n, A]` up to now."""
+    def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
         world = self.world_model
         known, stride = world.context_frames, world.codec.temporal_stride
         past = min(self._past, len(history.actions) // stride) * stride
@@ -218,29 +231,29 @@ class ModelRollouts:
         actions = [still] * before + history.actions
         first = len(frames) - past - known
         device = world.action_low.device
-        given = world.encode(as_clip(np.stack(frames[first : first + known]))[None].to(device))
+        video = as_clip(np.stack(frames[first : first + known]))[None].to(device)
         recent = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
-        return given, torch.from_numpy(recent)
+        codec = world.codec.with_reference(video[:, -1])
+        return _Given(codec, world.encode(video), torch.from_numpy(recent))
 
     def _futures(
         self,
-        given: Latent,
-        recent: Tensor,
+        given: _Given,
         actions: Actions,
         seed: int,
         stills: list[tuple[Frame, Latent]],
     ) -> ModelFutures:
         with torch.set_grad_enabled(actions.requires_grad):
-            latents = self._predict(given, recent, actions, seed)
-        codec = self.world_model.codec
-        now = codec.latent_frames(self._known_frames(recent))
+            latents = self._predict(given, actions, seed)
+        codec = given.codec
+        now = codec.latent_frames(given.frames)
         last = (actions.shape[1] - 1) % codec.temporal_stride
         before, after = latents[:, :now], latents[:, now:]
         return ModelFutures(codec, after, before, last, self._estimator, stills)
 
-    def _predict(self, given: Latent, recent: Tensor, actions: Actions, seed: int) -> Latent:
+    def _predict(self, given: _Given, actions: Actions, seed: int) -> Latent:
         """All latent frames, including the given ones, `[N, L, C, h, w]`."""
-        world, number = self.world_model, len(actions)
+        world, number, recent = self.world_model, len(actions), given.actions
         rows = torch.cat([recent.expand(number, -1, -1), actions], 1).to(world.action_low.device)
         stride = world.codec.temporal_stride
         rows = continued(rows, -rows.shape[1] % stride)
@@ -257,10 +270,6 @@ class ModelRollouts:
         normalised = world.normalise(torch.nn.functional.pad(rows, (0, 0, 0, 1)))
         conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
-        given = given.expand(number, *[-1] * (given.ndim - 1))
-        begin = Batch(given, conditioning, generators)
+        latents = given.latents.expand(number, -1, -1, -1, -1)
+        begin = Batch(latents, conditioning, generators)
         return world.objective.predict(world.model, begin, length, self._steps)
-
-    def _known_frames(self, recent: Tensor) -> int:
-        """Number of video frames from the first given one to the current one."""
-        return 1 + recent.shape[1]

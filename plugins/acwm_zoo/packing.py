@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -17,7 +17,9 @@ from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import EPISODES
 from acwm_core.files import made_whole, writing
+from acwm_core.model.build import build_codec
 from acwm_core.recipe import Recipe
+from acwm_core.recipe.compose import with_overrides
 from acwm_core.training.run import load_run, read_metadata, save_weights, training_of
 from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.model_card import model_card
@@ -50,7 +52,8 @@ def pack(
         run: a finished run.
         out: the folder to create.
         name: name by which the model will be used; that of the folder by default.
-        overrides: overrides of the evaluation, as in `acwm evaluate`.
+        overrides: overrides of the evaluation, as in `acwm evaluate`; those of the codec choose
+            another one with the same latents.
         data: the dataset to evaluate on; that of the recipe by default.
 
     Raises:
@@ -60,8 +63,11 @@ def pack(
     if out.exists():
         raise TrainingError(f"{out} already exists: remove it, or choose another name")
     folder = RunFolder(run)
-    recipe = load_run(run).recipe
-    facts = read_metadata(folder.weights)
+    codec = [each for each in overrides if each.split("=")[0].split(".")[0] == "codec"]
+    overrides = [each for each in overrides if each not in codec]
+    recipe, facts = load_run(run).recipe, read_metadata(folder.weights)
+    if codec:
+        recipe = _with_codec(recipe, codec, facts["codec"], run)
     weights = cast(dict[str, torch.Tensor], cast(Any, load_file)(folder.weights))
     with writing(out), made_whole(out) as partial:
         packed = RunFolder(partial)
@@ -80,12 +86,29 @@ def pack(
                 shutil.copyfile(file, getattr(packed, part))
         packed.recipe.write_text(_portable_recipe(recipe, packed.path).to_yaml(), encoding="utf-8")
         evaluate_run(partial, data=data or recipe.data["path"], overrides=overrides)
-        summary = replace(Summary.read(partial), videos=[])  # videos are not packed
+        summary = Summary.read(partial)
+        origin = _portable_facts(summary.provenance, packed.recipe.read_text(encoding="utf-8"))
+        summary = replace(summary, videos=[], provenance=origin)  # videos are not packed
         summary.write(partial / FOLDER)
         card = model_card(packed, summary, name or out.name)
         (partial / MODEL_CARD).write_text(card, encoding="utf-8")
         strip(partial)
     return out
+
+
+def _with_codec(recipe: Recipe, overrides: Sequence[str], latents: str, run: Path) -> Recipe:
+    """The recipe with another codec.
+
+    Raises:
+        TrainingError: it has other latents than those that the run was trained on.
+    """
+    chosen = Recipe.from_dict(with_overrides(recipe.to_dict(), overrides))
+    if build_codec(chosen.codec).latents_fingerprint() != latents:
+        raise TrainingError(
+            f"{' '.join(overrides)} decodes other latents than those that {run} was trained on: "
+            "train on from it, with training.init_from"
+        )
+    return chosen
 
 
 def strip(folder: Path) -> None:
@@ -98,6 +121,19 @@ def strip(folder: Path) -> None:
             path.rmdir()
 
 
+def _portable_path(data: str) -> str:
+    return f"data/{Path(data).name}" if Path(data).is_absolute() else data
+
+
+def _portable_facts(facts: Mapping[str, Any], recipe: str) -> dict[str, Any]:
+    """A summary's facts with the packed recipe, and without this machine's paths."""
+    dataset = dict(facts["dataset"])
+    place = _portable_path(dataset["path"])
+    if command := dataset.get("command"):
+        dataset["command"] = command.replace(dataset["path"], place)
+    return {**facts, "recipe": recipe, "dataset": {**dataset, "path": place}}
+
+
 def _portable_recipe(recipe: Recipe, out: Path) -> Recipe:
     """The recipe without this machine's paths and threads; the codec's files are copied to `out`.
 
@@ -106,9 +142,9 @@ def _portable_recipe(recipe: Recipe, out: Path) -> Recipe:
     """
     sections = recipe.to_dict()
     data, codec = sections["data"], sections["codec"]
-    if Path(data["path"]).is_absolute():
-        data["path"] = f"data/{Path(data['path']).name}"
-    sections["training"].pop("init_from", None)
+    data["path"] = _portable_path(data["path"])
+    for name in ("init_from", "ignore_mismatched_sizes"):
+        sections["training"].pop(name, None)
     sections["training"]["cpu_threads"] = None
     for name, value in codec.items():
         if isinstance(value, str) and Path(value).is_file():

@@ -1,5 +1,6 @@
 """Every installed codec conforms, and every check of codecs can fail."""
 
+import copy
 import importlib.util
 
 import pytest
@@ -75,6 +76,19 @@ class ForgetsTheFrameBefore(Identity):
     def _decode(self, latents):
         before = torch.cat([latents[:, :1], latents[:, :-1]], 1)
         return super()._decode(0.5 * (latents + before))
+
+
+@FLAWS.caught_by("a reference belongs to its video", "rest of the batch")
+class ShowsOneReferenceToAll(Identity):
+    shown = 0
+
+    def with_reference(self, frame):
+        seeing = copy.copy(self)
+        seeing.shown = frame[:1].mean()
+        return seeing
+
+    def _decode(self, latents):
+        return 0.9 * super()._decode(latents) + 0.1 * self.shown
 
 
 @FLAWS.caught_by("encoding is causal", "when later frames are added")

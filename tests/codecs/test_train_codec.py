@@ -10,7 +10,8 @@ from click.testing import CliRunner
 
 from acwm_codecs import train_codec
 from acwm_codecs.compact import Compact, Fine
-from acwm_codecs.frame_groups import load_videos, sample_groups
+from acwm_codecs.compact_reference import CompactReference
+from acwm_codecs.frame_groups import Source, load_videos, sample_groups
 from acwm_codecs.train_codec import RunningErrors, Training, detail_weights, learning_rate
 from acwm_core.cli import main
 from acwm_core.data.generate import generate
@@ -29,18 +30,38 @@ def moving_bars(shade, frames=12, size=(72, 80)):
     return video
 
 
-SOURCES = [[moving_bars((250, 40, 40))], [moving_bars((240, 240, 240))]]
+SOURCES = [Source([moving_bars(shade)]) for shade in ((250, 40, 40), (240, 240, 240))]
 
 
 def test_groups_are_four_frames_in_order_and_of_the_source_that_they_name():
-    groups, chosen = sample_groups(SOURCES, 200, np.random.default_rng(0))
-    assert groups.shape == (200, 12, 64, 64)
-    assert set(chosen.tolist()) == {0, 1}
-    frames = groups.unflatten(1, (4, 3))
+    groups = sample_groups(SOURCES, 200, np.random.default_rng(0))
+    assert groups.frames.shape == (200, 12, 64, 64)
+    assert set(groups.sources.tolist()) == {0, 1}
+    frames = groups.frames.unflatten(1, (4, 3))
     grey = (frames.amax(2) - frames.amin(2)).amax((1, 2, 3)) < 1e-6
-    assert torch.equal(grey, chosen == 1)  # whatever the order of the colours
+    assert torch.equal(grey, groups.sources == 1)  # whatever the order of the colours
     still = (frames[:, 0] == frames[:, 3]).flatten(1).all(1)
     assert 0.05 < still.float().mean() < 0.5
+
+
+def test_what_a_model_predicts_comes_with_its_frames_and_the_frame_that_it_was_given():
+    """In a video whose frames and cells are as bright as they are late, low and far right."""
+    video = np.zeros((13, 64, 80, 3), np.uint8)
+    latents = np.zeros((4, 16, 8, 10), np.float16)
+    rows, columns = np.arange(64)[:, None] // 8, np.arange(80) // 8
+    for frame in range(13):
+        video[frame] = (10 * frame + rows + 4 * columns)[..., None]
+    for frame in range(4):
+        last = 10 * 4 * frame
+        latents[frame] = last + np.arange(8)[:, None] + 4 * np.arange(10)
+    groups = sample_groups([Source([video], [latents])], 100, np.random.default_rng(0))
+    assert 50 < groups.predicted.sum() < 90
+    assert len(groups.latents) == groups.predicted.sum()
+    last = (groups.frames[groups.predicted][:, -1] * 255).round()
+    assert torch.equal(last[:, ::8, ::8], groups.latents[:, 0])
+    given = (groups.references[groups.predicted][:, 0] * 255).round()
+    assert (last - given).flatten(1).unique().tolist() == [40, 80, 120]
+    assert len({tuple(each[0, 0].tolist()) for each in groups.latents}) > 3  # various crops
 
 
 def test_the_learning_rate_warms_up_stays_and_falls_to_zero():
@@ -63,14 +84,14 @@ def test_training_from_nothing_learns_and_keeps_the_latents_normalised():
     training = Training(codec, SOURCES, batch=4, seed=0)
     seen = [training.running.values.mean().item() for _ in training.steps(60, 1e-3, 1)]
     assert seen[-1] < 0.35 * seen[0]
-    groups, _ = sample_groups(SOURCES, 16, np.random.default_rng(9))
+    frames = sample_groups(SOURCES, 16, np.random.default_rng(9)).frames
     with torch.inference_mode():
-        latents = codec.eval().normalise(codec.encoder(groups * 2 - 1))
+        latents = codec.eval().normalise(codec.encoder(frames * 2 - 1))
     assert 0.4 < latents.std().item() < 2.5
 
 
 def test_motion_and_edges_count_for_more():
-    groups, _ = sample_groups(SOURCES[:1], 8, np.random.default_rng(0))
+    groups = sample_groups(SOURCES[:1], 8, np.random.default_rng(0)).frames
     weights = detail_weights(groups)
     assert weights.mean((1, 2, 3)).tolist() == pytest.approx([1] * 8)
     changing = groups.unflatten(1, (4, 3)).std(1, keepdim=True).expand(-1, 4, -1, -1, -1) > 0.1
@@ -99,8 +120,9 @@ def test_a_training_that_was_stored_goes_on_as_if_nothing_had_happened(tmp_path,
         assert torch.equal(second.codec.state_dict()[name], value), name
 
 
-@pytest.mark.ci
-def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypatch):
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Runs the command on an episode of reacher."""
     pytest.importorskip("mujoco")
     monkeypatch.setattr(train_codec, "MEASURED_BATCHES", 2)
     generate(
@@ -113,6 +135,42 @@ def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypa
         done = CliRunner().invoke(main, command, catch_exceptions=False)
         assert done.exit_code == (2 if refused else 0), done.output
         return done.output
+
+    return run
+
+
+@pytest.mark.ci
+def test_a_decoder_learns_from_what_a_model_predicts(run, tmp_path):
+    from_models = ["--codec", "compact_reference", "--start", "compact", "--predicted-by"]
+    run("own.safetensors", *from_models, "reacher")
+    record = training_record(tmp_path / "own.safetensors")
+    assert record["decoder_only"]
+    assert [each["model"] for each in record["predicted_by"]] == ["reacher"]
+    trained = CompactReference(weights=str(tmp_path / "own.safetensors"))
+    video = torch.rand(1, 5, 3, 64, 64)
+    assert torch.equal(trained.encode(video), Compact().encode(video))
+    untold = [value for name, value in trained.reference.named_parameters() if "tell" in name]
+    assert any(value.abs().max() > 0 for value in untold)  # they began as zeros
+    from_own = ["--codec", "compact_reference", "--start", str(tmp_path / "own.safetensors")]
+    run("finer.safetensors", "--codec", "compact_reference", "--freeze-coarse")
+    finer = CompactReference(weights=str(tmp_path / "finer.safetensors"))
+    assert torch.equal(finer.decoder[4].weight, CompactReference().decoder[4].weight)
+    assert not torch.equal(
+        finer.decoder[6].first.weight, CompactReference().decoder[6].first.weight
+    )
+    for words, says in (
+        (["--freeze-coarse"], "goes with --codec compact_reference"),
+        (["--freeze-coarse", *from_own], "only the coarse layers that ship"),
+        (["--codec", "fine", "--predicted-by", "reacher"], "the latents of another codec"),
+        ([*from_models, "push_cube"], "push_cube at 64×64, of which there are no data"),
+        (["--predicted-by", "reacher", "--start", "random"], "not --start random"),
+        (["--codec", "compact", "--start", "fine"], "do not fit into compact"),
+    ):
+        assert says in run("other.safetensors", *words, refused=True)
+
+
+@pytest.mark.ci
+def test_the_command_goes_on_from_weights_and_records_the_way(run, tmp_path):
 
     run("one.safetensors", "--start", "random")
     run("two.safetensors", "--start", str(tmp_path / "one.safetensors"), "--seed", "5")
@@ -138,7 +196,7 @@ def test_the_command_goes_on_from_weights_and_records_the_way(tmp_path, monkeypa
         (["--threads", "-1"], "--threads"),
         (["--decay", "-1"], "--decay"),
         (["--peak", "nan"], "not finite"),
-        (["--decoder-only", "--start", "random"], "it cannot --start random"),
+        (["--decoder-only", "--start", "random"], "not --start random"),
     ):
         assert says in run("three.safetensors", *words, refused=True)
     assert "must end in .safetensors" in run("four.bin", refused=True)

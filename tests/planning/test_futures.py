@@ -63,6 +63,18 @@ def test_futures_are_the_rollout_of_the_model(bundle, history):
     torch.testing.assert_close(futures.video([2]), video[:, [6]])
 
 
+def test_futures_are_decoded_with_the_current_frame_as_reference(bundle, history, monkeypatch):
+    """Those that a cost sees, and those that are shown."""
+    codec, references = bundle.world_model.codec, []
+    monkeypatch.setattr(codec, "with_reference", lambda frame: references.append(frame) or codec)
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None)
+    seen(rollouts, history, candidates(2, 4))
+    rollouts.imagine(history, STILL, candidates(1, 4)[0], 0)
+    assert len(references) == 2
+    for frame in references:
+        torch.testing.assert_close(frame, frame_of(history.frames[-1]))
+
+
 def test_a_plan_that_ends_within_a_latent_frame_is_judged_where_it_ends(bundle, history):
     actions = candidates(2, 5)
     (futures,) = seen(ModelRollouts(bundle.world_model, bundle.card, None), history, actions)
@@ -93,12 +105,12 @@ def test_before_the_start_everything_stood_still(bundle, history):
     still = np.array([0.5, -0.5], np.float32)
     world.context_frames = 3
     try:
-        given, taken = rollouts._encode(start, still)
+        given = rollouts._given(start, still)
     finally:
         world.context_frames = 1
-    assert torch.equal(taken, torch.tensor([[[0.5, -0.5]] * 2]))
+    assert torch.equal(given.actions, torch.tensor([[[0.5, -0.5]] * 2]))
     frames = frame_of(history.frames[0])[None].expand(-1, 3, -1, -1, -1)
-    torch.testing.assert_close(given, world.encode(frames))
+    torch.testing.assert_close(given.latents, world.encode(frames))
 
 
 def test_candidates_differ_by_their_actions_alone(bundle, history):

@@ -37,9 +37,9 @@ SIZE = (64, 64)
 OLD = pytest.mark.skipif(torch.__version__ < NEEDS_TORCH, reason=f"needs PyTorch {NEEDS_TORCH}")
 
 
-def recurrent_world(given=1, **parameters):
+def recurrent_world(given=1, codec="identity", **parameters):
     """A small recurrent model with weights that make it follow actions and forget nothing."""
-    codec = catalog().create("codec", "identity")
+    codec = catalog().create("codec", codec)
     sizes = {"channels": 8, "width": 16, "blocks": 1, **parameters}
     model = catalog().create("model", "recurrent", latent_channels=codec.channels, **sizes)
     about = {"width": model.width, "layers": model.layers, "heads": model.heads}
@@ -91,6 +91,21 @@ def test_the_graphs_of_a_model_that_draws_take_its_noise():
         np.testing.assert_allclose(seen[seed], truth, atol=1e-4)
     assert np.abs(seen[1] - seen[2]).max() > 1e-3
     check(made, world, given.numpy(), actions[0].numpy())
+
+
+@OLD
+@pytest.mark.slow
+def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
+    world = recurrent_world(codec="compact_reference")
+    made = export_graphs(world, SIZE)
+    given = torch.rand(1, 3, *SIZE)
+    actions = torch.rand(8, 2) * 2 - 1
+    check(made, world, given.numpy(), actions.numpy())
+    other = OnnxStream(made, given.numpy())
+    stream = OnnxStream(made, given.numpy())
+    other._reference = np.zeros_like(other._reference)
+    rows = actions[:4].numpy()
+    assert np.abs(stream.step(rows) - other.step(rows)).max() > 0.01
 
 
 def test_models_that_cannot_be_exported_are_refused():

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from safetensors.torch import load_file
 
 from acwm_codecs.compact import Compact
+from acwm_codecs.compact_reference import CompactReference
 from acwm_codecs.train_codec import save
 from acwm_core.cli import main
 from acwm_core.errors import TrainingError
@@ -128,7 +129,7 @@ def test_what_came_before_is_told(run, packed, data, tmp_path):
     facts = {"cpu_seconds": 7200, "init_from": before}
     save_weights(file, load_file(file), read_metadata(file)["codec"], 12, **facts)
     sections = Recipe.from_yaml(RunFolder(run).recipe).to_dict()
-    sections["training"]["init_from"] = str(second)
+    sections["training"] |= {"init_from": str(second), "ignore_mismatched_sizes": True}
     sections["trainer"]["max_steps"] = 1
     fit(Recipe.from_dict(sections), third)
     shutil.rmtree(second)
@@ -136,7 +137,10 @@ def test_what_came_before_is_told(run, packed, data, tmp_path):
     made = pack(third, tmp_path / "made", data=data)
     told = "started from the weights of `second`: 42 steps, 3.0 CPU-hours."
     assert told in " ".join((made / "README.md").read_text().split())
-    assert str(tmp_path) not in (made / "recipe.yaml").read_text()
+    for file in ("recipe.yaml", "README.md", "evaluation/summary.json"):
+        text = (made / file).read_text()
+        assert str(tmp_path) not in text
+        assert str(data) not in text
 
 
 def test_training_counts_what_is_behind_it(run, packed):
@@ -251,6 +255,27 @@ def test_a_file_of_the_codec_ships_with_it(run, data, tmp_path):
     assert recipe.codec.params["weights"] == str(moved / "codec-weights.safetensors")
     video = load_run(moved).world_model.rollout(torch.rand(1, 3, 32, 32), torch.zeros(1, 9, 2))
     assert video.isfinite().all()
+
+
+def test_a_codec_with_the_same_latents_takes_the_place_of_the_old_one(data, tmp_path):
+    """A run on `compact` ships with the decoder that sees the given frame; no other codec does."""
+    parts = {
+        "codec": {"name": "compact"},
+        "model": {"name": "dit_xs", "width": 16, "layers": 1, "heads": 1},
+        "conditioner": {"name": "adaln"},
+    }
+    run = tiny.make_run(tmp_path / "run", data, parts=parts, **QUICK, episodes=2)
+    made = pack(run, tmp_path / "made", data=data, overrides=["codec=compact_reference"])
+    before, now = load_run(run).world_model, load_run(made).world_model
+    assert isinstance(now.codec, CompactReference)
+    first, actions = torch.rand(1, 3, 32, 32), torch.zeros(1, 9, 2)
+    for name, value in before.model.state_dict().items():
+        torch.testing.assert_close(now.model.state_dict()[name], value.bfloat16().float())
+    latents = [world.predict_latents(first, actions) for world in (before, now)]
+    torch.testing.assert_close(*latents, rtol=0.05, atol=0.05)
+    assert (before.rollout(first, actions) - now.rollout(first, actions)).abs().max() > 0.01
+    with pytest.raises(TrainingError, match=r"codec=fine decodes other latents than those that"):
+        pack(run, tmp_path / "other", data=data, overrides=["codec=fine"])
 
 
 def test_a_file_of_the_codec_that_could_run_code_does_not_ship(run, tmp_path):

@@ -1,7 +1,8 @@
 """Exports the stream of a world model as three ONNX graphs, which a browser can run.
 
 `start` maps the given frames to the last latent and a state, `step` maps the actions of a latent
-frame and the state to the next latent and state, and `decode` maps a latent to video frames.
+frame and the state to the next latent and state, and `decode` maps a latent, and the last given
+frame if the codec looks at it, to video frames.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from acwm_core.errors import MissingExtraError, RecipeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.objectives.objective import drawn_noise
-from acwm_core.model.shapes import Actions, Latent, Video
+from acwm_core.model.shapes import Actions, Frame, Latent, Video
 from acwm_core.model.world_model import WorldModel
 
 NEEDS_TORCH = "2.13"
@@ -97,12 +98,14 @@ class Step(_Part):
 class Decode(_Part):
     """Decodes a latent `[1, 1, C, h, w]` as the first latent frame of a video, and as a later one.
 
-    The two results are the video frames of each case.
+    The two results are the video frames of each case. For a codec that decodes with a reference,
+    that frame `[1, 3, H, W]` is a second input.
     """
 
-    def forward(self, latent: Latent) -> tuple[Video, Video]:
+    def forward(self, latent: Latent, *reference: Frame) -> tuple[Video, Video]:
         """Decode both ways; the common part is computed once."""
-        decoder = self.world.codec.frame_decoder()
+        codec = self.world.codec
+        decoder = (codec.with_reference(*reference) if reference else codec).frame_decoder()
         return decoder(latent), decoder(latent)
 
 
@@ -126,11 +129,11 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
         latent, *state = Start(world)(*begin)
         states = [f"state_{k}" for k in range(len(state))]
         moved = [f"next_{each}" for each in states]
-        graph = _graph
+        graph, shown = _graph, (latent, *_reference(world, given))
         return {
             "start": graph(Start(world), begin, ["given", "noise"], ["latent", *states]),
             "step": graph(Step(world), (actions, *state), ["actions", *states], ["latent", *moved]),
-            "decode": graph(Decode(world), (latent,), ["latent"], ["first", "frames"]),
+            "decode": graph(Decode(world), shown, ["latent", "reference"], ["first", "frames"]),
         }
 
 
@@ -143,6 +146,12 @@ def _draw(world: WorldModel, seed: int) -> tuple[Tensor, ...]:
     """The noise `[1, N]` of a stream with this seed; empty for a model that draws none."""
     noise = noise_size(world)
     return (drawn_noise((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
+
+
+def _reference(world: WorldModel, given: Video) -> tuple[Frame, ...]:
+    """The last given frame `[1, 3, H, W]`; empty if the codec does not look at it."""
+    frame = given[:, -1]
+    return () if world.codec.with_reference(frame) is world.codec else (frame,)
 
 
 def _check_exportable(world: WorldModel) -> None:
@@ -217,19 +226,20 @@ class OnnxStream:
             name: onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
             for name, graph in graphs.items()
         }
+        self._reference = given[None, -1]
         latent, *self._state = self._run("start", given[None], *draw)
-        first, later = self._run("decode", latent)
+        first, later = self._run("decode", latent, self._reference)
         self.given: NDArray[np.float32] = (first if len(given) == 1 else later)[0, -1]
 
     def step(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Predict the frames `[stride, 3, H, W]` for `stride` raw actions."""
         latent, *self._state = self._run("step", actions[None], *self._state)
-        return self._run("decode", latent)[1][0]
+        return self._run("decode", latent, self._reference)[1][0]
 
     def _run(self, name: str, *values: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         session = self._sessions[name]
         names = [each.name for each in session.get_inputs()]
-        return cast(Any, session.run(None, dict(zip(names, values, strict=True))))
+        return cast(Any, session.run(None, dict(zip(names, values, strict=False))))
 
 
 def check(

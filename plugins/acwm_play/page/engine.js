@@ -13,7 +13,7 @@ async function unpack(name) {
 // What the worker does; it sees nothing of the page.
 function inference() {
   const sessions = {}, queue = [];
-  let state = [], working = false;
+  let state = [], reference = null, working = false;
 
   async function begin({ glue, wasm, graphs }) {
     ort.env.wasm.numThreads = 1; // threads would need headers of a server
@@ -52,18 +52,19 @@ function inference() {
           for (let i = 0; i < size; i += 1) data[(3 * k + c) * size + i] = frames[3 * (k * size + i) + c] / 255;
         }
       }
+      reference = new ort.Tensor("float32", data.slice(-3 * size), [1, 3, height, width]); // the last of them
       const given = new ort.Tensor("float32", data, [1, n, 3, height, width]);
       const noise = draw.length ? [new ort.Tensor("float32", draw, [1, draw.length])] : [];
       const [latent, ...begun] = await run("start", given, ...noise);
       state = begun;
-      const decoded = pixels((await run("decode", latent))[n === 1 ? 0 : 1]);
+      const decoded = pixels((await run("decode", latent, reference))[n === 1 ? 0 : 1]);
       return decoded.slice(-3 * size);
     },
     async step({ actions }) {
       const rows = new ort.Tensor("float32", actions.flat(), [1, actions.length, actions[0].length]);
       const [latent, ...moved] = await run("step", rows, ...state);
       state = moved;
-      return pixels((await run("decode", latent))[1]);
+      return pixels((await run("decode", latent, reference))[1]);
     },
   };
 
