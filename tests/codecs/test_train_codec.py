@@ -125,6 +125,7 @@ def run(tmp_path, monkeypatch):
     """Runs the command on an episode of reacher."""
     pytest.importorskip("mujoco")
     monkeypatch.setattr(train_codec, "MEASURED_BATCHES", 2)
+    monkeypatch.chdir(tmp_path)
     generate(
         "reacher", tmp_path / "d", episodes={"train": 1, "ind_test": 1}, seed=3, size=64, workers=0
     )
