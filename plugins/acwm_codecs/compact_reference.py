@@ -107,7 +107,8 @@ class CompactReference(Compact):
         """Without what is frozen, and without the encoder, if it is that which ships."""
         state = super().stored()
         if self._encodes_as_shipped(state):
-            state = {name: value for name, value in state.items() if name not in _encoder()}
+            shipped = _encoder()
+            state = {name: value for name, value in state.items() if name not in shipped}
         if self._frozen:
             coarse = {name: state.pop(name) for name in [*state] if _is_coarse(name)}
             state[COMPLETED_BY] = _identity(coarse)
