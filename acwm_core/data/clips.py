@@ -289,12 +289,16 @@ class Clips(ABC):
         Raises:
             DataError: a shard is missing or damaged.
         """
+        frames = common_length(self.lengths, indices)
+        return {**self._frames(indices, frames), **self.inputs(indices)}
+
+    def inputs(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """What `batch` returns beside the frames."""
         import torch
 
         frames = common_length(self.lengths, indices)
         rows = [self._inputs(int(index), frames) for index in indices]
-        stacked = {name: torch.as_tensor(np.stack([r[name] for r in rows])) for name in rows[0]}
-        return {**self._frames(indices, frames), **stacked}
+        return {name: torch.as_tensor(np.stack([r[name] for r in rows])) for name in rows[0]}
 
     @abstractmethod
     def _frames(self, indices: Sequence[int], frames: int) -> dict[str, Tensor]:

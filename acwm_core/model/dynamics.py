@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal, cast
 
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
@@ -145,7 +145,8 @@ class Predictor(DynamicsModel):
     `forward` does, so that the future stays the same one.
 
     One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
-    which the framework fills in, and implements `state_loss`.
+    which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
+    actions move the agent without a picture.
 
     One that saves work if it need not return all frames (`skips`) takes the further keyword
     ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
@@ -178,6 +179,19 @@ class Predictor(DynamicsModel):
         States are known in training only; `forward` has to do without.
         """
         raise RecipeError(f"{type(self).__name__} learns no states: leave out data.states")
+
+    def motion_loss(self, states: Tensor, conditioning: Conditioning, random: Generator) -> Tensor:
+        """The loss of how actions move the agent, without pictures, a scalar. Optional.
+
+        Args:
+            states: of the agent in each latent frame, `[B, L, S]`, scaled as in `Batch.states`.
+            conditioning: the embedded actions of the clips.
+            random: a CPU generator, the only source of randomness.
+        """
+        raise RecipeError(
+            f"{type(self).__name__} learns no motion without pictures: leave out "
+            "training.agent_steps"
+        )
 
     def stream(self, given: Latent, *, context: int) -> LatentStream:
         """Predict one latent frame at a time, without end. Optional, for causal models.

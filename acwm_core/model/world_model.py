@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
-from acwm_core.model.dynamics import DynamicsModel, hidden_matrices
+from acwm_core.model.dynamics import DynamicsModel, Predictor, hidden_matrices
 from acwm_core.model.objectives.objective import Batch, Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
 from acwm_core.model.stream import Stream, continued
@@ -139,10 +139,36 @@ class WorldModel(nn.Module):
         rows = self._prepare(actions, latents.shape[1])
         conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
         known = self.codec.latent_frames(self.context_frames)
-        if states is not None:
-            states = (states[:, :: self.codec.temporal_stride] - self.state_mean) / self.state_std
-        batch = Batch(latents, conditioning, generators, states)
+        batch = Batch(latents, conditioning, generators, self._scaled(states))
         return self.objective.loss(self.model, batch, known)
+
+    def motion_loss(self, actions: Actions, states: Tensor, random: torch.Generator) -> Tensor:
+        """The loss of how actions move the agent, without pictures, a scalar.
+
+        Args:
+            actions: as in `loss`.
+            states: as in `loss`.
+            random: a CPU generator.
+
+        Raises:
+            RecipeError: the model learns none.
+        """
+        if not isinstance(self.model, Predictor):
+            raise RecipeError(
+                f"{type(self.model).__name__} learns no states: leave out training.agent_steps"
+            )
+        frames = self.codec.latent_frames(states.shape[1])
+        rows = self._prepare(actions, frames)
+        conditioning = self.conditioner.condition(rows, frames, self.model.width)
+        scaled = self._scaled(states)
+        assert scaled is not None
+        return self.model.motion_loss(scaled, conditioning, random)
+
+    def _scaled(self, states: Tensor | None) -> Tensor | None:
+        """States of a clip's frames, scaled, those of its latent frames."""
+        if states is None:
+            return None
+        return (states[:, :: self.codec.temporal_stride] - self.state_mean) / self.state_std
 
     def rollout(
         self,

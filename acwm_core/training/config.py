@@ -75,6 +75,9 @@ class TrainingConfig:
         random_starts: fraction of the steps in which a random number of latent frames is cut off
             the start of clips, so that a model trained on whole episodes also starts from frames
             other than the first. A first frame is alone in its latent frame, a later one is not.
+        agent_steps: steps, before the first one on pictures, that learn from states and actions
+            alone how actions move the agent (`data.states`); what they taught then stays as it is.
+            They cost little, and the agent is known better than pictures teach it. 0 for none.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
@@ -106,6 +109,7 @@ class TrainingConfig:
     decay_start: float = 0.0
     growing_horizon: float = 0.0
     random_starts: float = 0.0
+    agent_steps: int = 0
     ema_decay: float = 0.999
     init_from: str | None = None
     ignore_mismatched_sizes: bool = False
@@ -133,6 +137,7 @@ class TrainingConfig:
             ("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)"),
             ("growing_horizon", 0 <= self.growing_horizon <= 1, "must lie in [0, 1]"),
             ("random_starts", 0 <= self.random_starts <= 1, "must lie in [0, 1]"),
+            ("agent_steps", self.agent_steps >= 0, "must be 0 or more"),
             ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
             (
                 "ignore_mismatched_sizes",

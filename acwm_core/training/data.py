@@ -108,6 +108,11 @@ class ClipData(L.LightningDataModule):
         self._train = self._training_clips()
         self._validation = self._clips(self._split[1], self._stride, cached=self._cached)
 
+    @property
+    def training_clips(self) -> ClipDataset | LatentClipDataset:
+        """The clips to train on, once they are open."""
+        return self._train
+
     def _training_clips(self) -> ClipDataset | LatentClipDataset:
         return self._clips(
             self._split[0],

@@ -19,7 +19,7 @@ from acwm_core.data.clips import DataConfig
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.loader import WORKER_DIED
 from acwm_core.env.environment import resolve_size
-from acwm_core.errors import AcwmError, AcwmWarning, TrainingError
+from acwm_core.errors import AcwmError, AcwmWarning, RecipeError, TrainingError
 from acwm_core.model.build import build_world_model
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, recipe_differences
@@ -104,6 +104,11 @@ def _train(
     continued: Sequence[Logger],
 ) -> None:
     config = TrainingConfig(**recipe.training)
+    if config.agent_steps and not recipe.data.get("states"):
+        raise RecipeError(
+            f"training.agent_steps={config.agent_steps} learn how the agent's states move: name "
+            "them, data.states=[…], or leave it out"
+        )
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, episodes.card.environment)
     start = None

@@ -104,10 +104,22 @@ class AgentPath(nn.Module):
         frames = batch.latents.take_along_dim(picked[..., None, None, None], 1)
         true = states.take_along_dim(picked[..., None], 1)
         read = functional.mse_loss(self.read(frames.flatten(0, 1)), true.flatten(0, 1))
+        if not self.change.weight.requires_grad:
+            return read  # its motion was learnt before
         noise = sent(drawn_noise(states.shape[2:], batch.generators), states)
+        return read + self.motion_loss(states, actions, noise)
+
+    def motion_loss(self, states: Tensor, actions: Tensor, noise: Tensor) -> Tensor:
+        """Squared error of the states that actions lead to from a true one.
+
+        Args:
+            states: true ones, `[B, L, S]`.
+            actions: embedded, `[B, L, width]`.
+            noise: standard normal, `[B, S]`.
+        """
         agent = self.begin(states[:, 0] + START_NOISE * noise)
         moved: list[Tensor] = []
         for frame in range(1, states.shape[1]):
             agent = self.step(agent, actions[:, frame])
             moved.append(agent.state)
-        return read + functional.mse_loss(torch.stack(moved, 1), states[:, 1:])
+        return functional.mse_loss(torch.stack(moved, 1), states[:, 1:])

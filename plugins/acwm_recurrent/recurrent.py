@@ -154,6 +154,14 @@ class RecurrentModel(Predictor):
         assert self.agent is not None
         return self.agent.loss(batch, self.actions(batch.conditioning))
 
+    def motion_loss(
+        self, states: Tensor, conditioning: Conditioning, random: torch.Generator
+    ) -> Tensor:
+        """The loss of how actions move the agent; see `AgentPath.motion_loss`."""
+        assert self.agent is not None
+        noise = sent(torch.randn(states[:, 0].shape, generator=random), states)
+        return self.agent.motion_loss(states, self.actions(conditioning), noise)
+
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()
     ) -> LatentStream:

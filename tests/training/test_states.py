@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
+import acwm
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import ClipDataset, DataConfig
 from acwm_core.data.dataset import EpisodeDataset
@@ -59,7 +61,7 @@ def test_the_scale_is_that_of_the_training_episodes(data):
 
 
 def test_a_killed_run_resumes_with_the_same_states(data, tmp_path, monkeypatch):
-    asked = {**LEARNER, "data": PLACES}
+    asked = {**LEARNER, "data": PLACES, "training": {"agent_steps": 3}}
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
     monkeypatch.setattr(Kill, "batch", 7)
     run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
@@ -72,6 +74,38 @@ def test_a_killed_run_resumes_with_the_same_states(data, tmp_path, monkeypatch):
     assert not [name for name in plain if "agent" in name]
 
 
+def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
+    """Positions go on by the actions: a second of steps without pictures finds out how."""
+
+    def trained(name, steps, pictures=2, **sections):
+        asked = {**LEARNER, "data": PLACES, "training": {"agent_steps": steps}, **sections}
+        asked["trainer"] = {"max_steps": pictures}
+        return RunFolder(fit(tiny_recipe(data, **asked), tmp_path / name))
+
+    def weights(run):
+        held = load_file(run.weights)
+        return {k: v for k, v in held.items() if "agent.gru" in k or "embedder.mlp" in k}
+
+    config = DataConfig(str(data), validation_episodes=2, states=tuple(PLACES["states"]))
+    episodes = EpisodeDataset(data, "train")
+    clips = ClipDataset(episodes, indices=range(6), frames=9, temporal_stride=2, **PLACES)
+    scale = ClipData(config, episodes, TinyCodec(), 0).state_scale()
+
+    @torch.no_grad()
+    def error(run):
+        world = acwm.load(run.path).world_model
+        world.state_mean, world.state_std = scale
+        held = clips.inputs(range(len(clips)))
+        return world.motion_loss(**held, random=torch.Generator().manual_seed(0)).item()
+
+    before, after = trained("before", 0), trained("after", 300)
+    assert error(after) < 0.1 * error(before)
+    longer = trained("longer", 300, pictures=5)
+    assert weights(after).keys() == weights(longer).keys() != set()
+    for name, value in weights(after).items():
+        torch.testing.assert_close(value, weights(longer)[name], rtol=0, atol=0)
+
+
 def test_what_cannot_be_learnt_is_refused(data, mirrored, tmp_path):
     def refused(error: type[AcwmError], said: str, folder=data, **sections):
         with pytest.raises(error, match=said):
@@ -80,6 +114,7 @@ def test_what_cannot_be_learnt_is_refused(data, mirrored, tmp_path):
 
     refused(RecipeError, "has no state 'angle', but position", data={"states": ["angle"]})
     refused(RecipeError, "learns no states", objective={}, model={})
+    refused(RecipeError, "name them", data={}, training={"agent_steps": 3})
     refused(RecipeError, "random_access", data={**PLACES, "reader": "webdataset"})
     card = DatasetCard.read(mirrored)
     silent = Symmetry((1, -2), mirrored=True)
