@@ -44,13 +44,19 @@ def main(picture: Path | None) -> None:
     for name in shipped():
         print("| " + " | ".join(row(name)) + " |")
     if picture:
-        rows = [strip(name) for name in shipped()]
+        worlds = [name for name in shipped() if name == world_of(name)]  # no second one of a world
+        rows = [strip(name) for name in worlds]
         half = -(-len(rows) // 2)
         columns = [below(rows[:half], gap=12), below(rows[half:], gap=12)]
         height = max(map(len, columns))
         fill = [((0, height - len(each)), (0, 0), (0, 0)) for each in columns]
         filled = [np.pad(c, f, constant_values=255) for c, f in zip(columns, fill, strict=True)]
         Image.fromarray(beside(filled)).save(picture, quality=88)
+
+
+def world_of(name: str) -> str:
+    """The environment that a model was trained on."""
+    return DatasetCard.read(RunFolder(folder(name)).card).environment.name
 
 
 def row(name: str) -> list[str]:

@@ -209,6 +209,11 @@ class EnvironmentChecks(TaskChecks):
             error = np.abs(turned.states[name] - wanted).max()
             if error > OFF * np.abs(wanted).max() + 1e-6:
                 return f"state {name!r} differs by {error:.2g}"
+        for name in symmetry.headings:
+            wanted = symmetry.of_states(name, np.asarray(usual.states[name], np.float64))
+            off = np.angle(np.exp(1j * (turned.states[name] - wanted)))[usual.states[name] != 0]
+            if off.size and np.abs(off).max() > OFF * np.pi:
+                return f"state {name!r} differs by {np.abs(off).max():.2g} rad"
         masks = symmetry.of_frames(usual.masks)
         colours = symmetry.of_frames(np.moveaxis(usual.video, -1, 1))
         differs = np.abs(colours.astype(float) - np.moveaxis(turned.video, -1, 1)).mean(1) / 255

@@ -31,6 +31,8 @@ class Symmetry:
             counter-clockwise.
         states: how it transforms the last axis of fields of the state; those that do not transform
             so simply are left out.
+        headings: fields of the state that hold angles in the plane of the frame, in rad and
+            counter-clockwise from the right. They turn with it.
 
     Raises:
         ShapeError: it is none, or the identity of frames.
@@ -40,6 +42,7 @@ class Symmetry:
     mirrored: bool = False
     quarter_turns: int = 0
     states: Mapping[str, Axes] = field(default_factory=dict[str, Axes])
+    headings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.quarter_turns not in range(4) or not (self.mirrored or self.quarter_turns):
@@ -83,6 +86,9 @@ class Symmetry:
         Raises:
             ShapeError: it is not said how the field is transformed.
         """
+        if name in self.headings:
+            turned = (np.pi - values if self.mirrored else values) + self.quarter_turns * np.pi / 2
+            return np.remainder(turned + np.pi, 2 * np.pi).astype(values.dtype) - np.pi
         if name not in self.states:
             raise ShapeError(f"the symmetry {self.name} does not say how it transforms {name}")
         axes = self.states[name]
@@ -103,9 +109,10 @@ class Symmetry:
             for name, axes in self.states.items()
             if name in first.states
         }
+        headings = tuple(name for name in self.headings if name in first.headings)
         mirrored = self.mirrored != first.mirrored
         if mirrored or turns:
-            return Symmetry(actions, mirrored, turns, states)
+            return Symmetry(actions, mirrored, turns, states, headings)
         if any(axes != tuple(range(1, len(axes) + 1)) for axes in (actions, *states.values())):
             raise ShapeError(
                 f"{self.name} after {first.name} leaves frames as they are and changes actions or "
@@ -118,7 +125,8 @@ class Symmetry:
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON or YAML."""
         states = {name: tuple(axes) for name, axes in values.get("states", {}).items()}
         of_frames = {name: values[name] for name in ("mirrored", "quarter_turns") if name in values}
-        return cls(tuple(values["actions"]), states=states, **of_frames)
+        headings = tuple(values.get("headings", ()))
+        return cls(tuple(values["actions"]), states=states, headings=headings, **of_frames)
 
 
 def permuted(values: NDArray[Any], axes: Axes) -> NDArray[Any]:

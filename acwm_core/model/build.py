@@ -11,7 +11,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, Predictor
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
@@ -47,7 +47,7 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
     codec = build_codec(recipe.codec)
     objective = build_objective(recipe.objective)
     states = state_size(recipe.data.get("states", ()), card)
-    model = build_model(recipe.model, objective, codec.channels, states)
+    model = build_model(recipe.model, objective, codec.channels, states, codec.temporal_stride)
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
@@ -86,26 +86,35 @@ def build_objective(choice: ComponentConfig) -> Objective[Any]:
 
 
 def build_model(
-    choice: ComponentConfig, objective: Objective[Any], latent_channels: int, state_size: int = 0
+    choice: ComponentConfig,
+    objective: Objective[Any],
+    latent_channels: int,
+    state_size: int = 0,
+    temporal_stride: int = 1,
 ) -> DynamicsModel:
     """Build the dynamics model that a recipe names, as the objective needs it.
 
     Raises:
-        RecipeError: there are states to learn, which the model or the objective cannot.
+        RecipeError: there are states to learn, which the model or the objective cannot; or there
+            are none, and the model needs them.
     """
     wanted = {"causal": objective.causal, "inputs": objective.inputs}
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
     fitted = {"latent_channels": latent_channels}
+    takes = signature(catalog().component("model", choice.name).load()).parameters
+    if "temporal_stride" in takes:
+        fitted["temporal_stride"] = temporal_stride
     if state_size:
-        made_of = catalog().component("model", choice.name).load()
-        if not objective.learns_states or "state_size" not in signature(made_of).parameters:
+        if not objective.learns_states or "state_size" not in takes:
             raise RecipeError(
                 f"model={choice.name} with {type(objective).__name__} learns no states of the "
                 "agent: leave out data.states, or choose a model that does"
             )
         fitted["state_size"] = state_size
     model = build_component("model", choice, DynamicsModel, **fitted)
+    if isinstance(model, Predictor) and model.follows_states and not state_size:
+        raise RecipeError(f"model={choice.name} learns from states: name them in data.states")
     objective.check_model(model)
     return model
 

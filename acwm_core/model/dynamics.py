@@ -148,6 +148,10 @@ class Predictor(DynamicsModel):
     which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
     actions move the agent without a picture.
 
+    One that draws pictures from states (`follows_states`) gets them as they were recorded, in every
+    video frame `[B, T, S]`, in `state_loss` and `motion_loss`, and while it is trained, by the
+    further keyword ``states: Tensor | None`` of `forward`. Without them it has to know by itself.
+
     One that saves work if it need not return all frames (`skips`) takes the further keyword
     ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
     return, counted from the first predicted one.
@@ -155,10 +159,12 @@ class Predictor(DynamicsModel):
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
         skips: whether `forward` takes ``only``.
+        follows_states: whether `forward` takes ``states``, and all states are as recorded.
     """
 
     streams: bool = False
     skips: bool = False
+    follows_states: bool = False
 
     @abstractmethod
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
@@ -180,13 +186,17 @@ class Predictor(DynamicsModel):
         """
         raise RecipeError(f"{type(self).__name__} learns no states: leave out data.states")
 
-    def motion_loss(self, states: Tensor, conditioning: Conditioning, random: Generator) -> Tensor:
+    def motion_loss(
+        self, states: Tensor, conditioning: Conditioning, random: Generator, *, progress: float
+    ) -> Tensor:
         """The loss of how actions move the agent, without pictures, a scalar. Optional.
 
         Args:
             states: of the agent in each latent frame, `[B, L, S]`, scaled as in `Batch.states`.
             conditioning: the embedded actions of the clips.
             random: a CPU generator, the only source of randomness.
+            progress: share of the training that is over, 0 to 1, for models that learn from short
+                clips first.
         """
         raise RecipeError(
             f"{type(self).__name__} learns no motion without pictures: leave out "

@@ -142,13 +142,16 @@ class WorldModel(nn.Module):
         batch = Batch(latents, conditioning, generators, self._scaled(states))
         return self.objective.loss(self.model, batch, known)
 
-    def motion_loss(self, actions: Actions, states: Tensor, random: torch.Generator) -> Tensor:
+    def motion_loss(
+        self, actions: Actions, states: Tensor, random: torch.Generator, *, progress: float
+    ) -> Tensor:
         """The loss of how actions move the agent, without pictures, a scalar.
 
         Args:
             actions: as in `loss`.
             states: as in `loss`.
             random: a CPU generator.
+            progress: share of the training that is over, 0 to 1.
 
         Raises:
             RecipeError: the model learns none.
@@ -162,12 +165,12 @@ class WorldModel(nn.Module):
         conditioning = self.conditioner.condition(rows, frames, self.model.width)
         scaled = self._scaled(states)
         assert scaled is not None
-        return self.model.motion_loss(scaled, conditioning, random)
+        return self.model.motion_loss(scaled, conditioning, random, progress=progress)
 
     def _scaled(self, states: Tensor | None) -> Tensor | None:
-        """States of a clip's frames, scaled, those of its latent frames."""
-        if states is None:
-            return None
+        """States of a clip's frames, scaled, those of its latent frames; see `Batch.states`."""
+        if states is None or (isinstance(self.model, Predictor) and self.model.follows_states):
+            return states
         return (states[:, :: self.codec.temporal_stride] - self.state_mean) / self.state_std
 
     def rollout(

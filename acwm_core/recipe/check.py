@@ -33,7 +33,7 @@ REMOVED = {
 """What takes the place of parameters that old recipes set, by section and name."""
 
 FITTED = {
-    "model": ("latent_channels", "state_size"),
+    "model": ("latent_channels", "state_size", "temporal_stride"),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads", "widths"),
 }
 """Parameters that follow from the other components and the dataset, never from a recipe."""

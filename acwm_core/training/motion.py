@@ -51,7 +51,7 @@ def learn_motion(
             for group in optimizer.param_groups:
                 group["lr"] = RATE * min(1, (step + 1) / WARMUP, 1.6 * (1 - step / steps))
             optimizer.zero_grad()
-            loss = world_model.motion_loss(*next(batches), random)
+            loss = world_model.motion_loss(*next(batches), random, progress=step / steps)
             cast(Any, loss).backward()
             if not nn.utils.clip_grad_norm_(learnt, CLIPPED).isfinite():
                 raise TrainingError(
@@ -83,6 +83,6 @@ def _depends(
 ) -> Sequence[nn.Parameter]:
     """The weights on which the loss of the motion depends."""
     weights = [each for each in world_model.parameters() if each.requires_grad]
-    loss = world_model.motion_loss(actions, states, random)
+    loss = world_model.motion_loss(actions, states, random, progress=0)
     gradients = cast(Sequence[Tensor | None], torch.autograd.grad(loss, weights, allow_unused=True))
     return [each for each, of_it in zip(weights, gradients, strict=True) if of_it is not None]

@@ -1,15 +1,21 @@
-"""Registers the recurrent dynamics model, and the objective by which it learns to draw."""
+"""Registers the recurrent dynamics models, and the objective by which it learns to draw."""
 
 from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
 def register_models(registry: Registry) -> None:
-    """Register the model. Its parameters set its size."""
+    """Register the models. Their parameters set their size."""
     registry.add(
         "recurrent",
         "acwm_recurrent.recurrent:RecurrentModel",
         summary="1 M parameters: predicts the next latent frame at once, without noise",
+        objective="regression",
+    )
+    registry.add(
+        "planar_bodies",
+        "acwm_recurrent.planar:PlanarBodies",
+        summary="1 M parameters: moves the poses of bodies on a table, and draws them",
         objective="regression",
     )
 

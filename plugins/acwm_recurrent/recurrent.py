@@ -155,7 +155,12 @@ class RecurrentModel(Predictor):
         return self.agent.loss(batch, self.actions(batch.conditioning))
 
     def motion_loss(
-        self, states: Tensor, conditioning: Conditioning, random: torch.Generator
+        self,
+        states: Tensor,
+        conditioning: Conditioning,
+        random: torch.Generator,
+        *,
+        progress: float,
     ) -> Tensor:
         """The loss of how actions move the agent; see `AgentPath.motion_loss`."""
         assert self.agent is not None

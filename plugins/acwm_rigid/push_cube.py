@@ -76,8 +76,10 @@ def _symmetry(pushers: int, axes: Axes, **of_frames: Any) -> Symmetry:
     """A symmetry of the square table; `axes` say what it does to (x, y)."""
     targets = [axis + (2 * k if axis > 0 else -2 * k) for k in range(pushers) for axis in axes]
     # Velocities are left out: squeezed between others, things jerk in no predictable way.
-    places = {"pusher_position": axes, "cube_position": (*axes, 3)}
-    return Symmetry(tuple(targets), states=places, **of_frames)
+    each = tuple(range(1, MAX_CUBES + 1))
+    cubes = {"cube_present": each, "cube_position": (*axes, 3)}
+    places = {"pusher_position": axes, **cubes}
+    return Symmetry(tuple(targets), states=places, headings=("cube_yaw",), **of_frames)
 
 
 def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
@@ -171,7 +173,8 @@ class PushCube(SceneEnvironment[PushSimulation]):
 
     def _transform(self, symmetry: Symmetry) -> None:
         cubes, plane = self.simulation.cubes, symmetry.plane
-        yaw = (-cubes.yaw if symmetry.mirrored else cubes.yaw) + symmetry.quarter_turns * np.pi / 2
+        yaw = np.pi - cubes.yaw if symmetry.mirrored else cubes.yaw
+        yaw = yaw + symmetry.quarter_turns * np.pi / 2
         self._pushers = self._pushers @ plane.T
         self.put(cubes.xy @ plane.T, yaw, self._pushers)
 

@@ -1,6 +1,7 @@
 """Symmetries: those that worlds declare hold in the simulator; groups act alike everywhere."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -55,6 +56,19 @@ def test_a_dot_moves_in_the_frame_as_its_place_does_in_the_plane():
         frame[0, 3] = 1  # one to the right of the middle and two up
         (row,), (column,) = np.nonzero(each.of_frames(frame))
         np.testing.assert_array_equal(each.plane @ [1, 2], [column - 2, 2 - row])
+
+
+def test_a_heading_turns_as_the_direction_it_points_in():
+    angles = np.linspace(-3, 3, 7)[:, None]
+    named = [
+        Symmetry(g.actions, g.mirrored, g.quarter_turns, headings=("yaw",)) for g in (MIRROR, TURN)
+    ]
+    for each in group(*named):
+        x, y = each.plane @ [np.cos(angles[:, 0]), np.sin(angles[:, 0])]
+        found = each.of_states("yaw", angles)[:, 0]
+        assert np.abs(found).max() <= np.pi
+        np.testing.assert_allclose([np.cos(found), np.sin(found)], [x, y], atol=1e-12)
+        assert Symmetry.from_dict(json.loads(json.dumps(asdict(each)))) == each
 
 
 def test_frames_that_would_change_their_size_are_left_out():

@@ -37,11 +37,11 @@ SIZE = (64, 64)
 OLD = pytest.mark.skipif(torch.__version__ < NEEDS_TORCH, reason=f"needs PyTorch {NEEDS_TORCH}")
 
 
-def recurrent_world(given=1, codec="identity", **parameters):
-    """A small recurrent model with weights that make it follow actions and forget nothing."""
+def recurrent_world(given=1, codec="identity", name="recurrent", **parameters):
+    """A small model with weights that make it follow actions and forget nothing."""
     codec = catalog().create("codec", codec)
     sizes = {"channels": 8, "width": 16, "blocks": 1, **parameters}
-    model = catalog().create("model", "recurrent", latent_channels=codec.channels, **sizes)
+    model = catalog().create("model", name, latent_channels=codec.channels, **sizes)
     about = {"width": model.width, "layers": model.layers, "heads": model.heads}
     conditioner = catalog().create(
         "conditioner",
@@ -106,6 +106,14 @@ def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
     other._reference = np.zeros_like(other._reference)
     rows = actions[:4].numpy()
     assert np.abs(stream.step(rows) - other.step(rows)).max() > 0.01
+
+
+@OLD
+@pytest.mark.slow
+def test_the_graphs_of_a_model_that_moves_bodies_are_its_stream():
+    world = recurrent_world(name="planar_bodies", bodies=2)
+    made = export_graphs(world, SIZE)
+    check(made, world, torch.rand(1, 3, *SIZE).numpy(), (torch.rand(24, 2) * 2 - 1).numpy())
 
 
 def test_models_that_cannot_be_exported_are_refused():

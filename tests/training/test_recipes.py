@@ -70,6 +70,7 @@ def data_of(tmp_path_factory):
         ("push_cube_small", ("codec=identity",)),
         ("push_cube_small", ("objective=diffusion_forcing",)),
         ("push_cube", ("+small", "+recurrent")),
+        ("push_cube", ("+small", "+recurrent", "+planar_bodies", "training.agent_steps=2")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )

@@ -66,7 +66,7 @@ class Regression(Objective[Predictor]):
     ) -> tuple[Latent, Latent]:
         """Predicted and true latents, each `[B, N, C, h, w]`, of all frames or of `only` some."""
         beginning = replace(batch, latents=batch.latents[:, :known])
-        made = _predicted(model, beginning, batch.latents.shape[1], only)
+        made = _predicted(model, beginning, batch.latents.shape[1], only, taught=model.training)
         true = batch.latents[:, known:]
         if only is not None:
             true = true.take_along_dim(only[..., None, None, None], 1)
@@ -112,11 +112,21 @@ class Regression(Objective[Predictor]):
         return batch.picked(self.frames, predicted) if model.training else None
 
 
-def _predicted(model: Predictor, given: Batch, frames: int, only: Tensor | None = None) -> Latent:
+def _predicted(
+    model: Predictor,
+    given: Batch,
+    frames: int,
+    only: Tensor | None = None,
+    *,
+    taught: bool = False,
+) -> Latent:
+    """The predicted frames; with `taught`, a model that follows states is told the true ones."""
     batch, known, *size = given.latents.shape
     further = _drawing(model, given.generators)
     if only is not None:
         further["only"] = only
+    if taught and model.follows_states:
+        further["states"] = given.states
     made = model(given.latents, given.conditioning, frames, **further)
     number = frames - known if only is None else only.shape[1]
     check_shape(model, "forward", made, batch, number, *size)

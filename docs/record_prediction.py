@@ -1,4 +1,4 @@
-"""Write water.webp, the first picture of README.md and the site: `python docs/record_water.py`.
+"""Write prediction.webp, the first picture of README.md: `python docs/record_prediction.py`.
 
 A simulated test episode, drawn large, beside what the model that ships gets of it and what it
 predicts. The model is right or wrong as it is: its frames are only enlarged.
@@ -17,12 +17,12 @@ from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.shipped import folder
 
-OUT = Path(__file__).resolve().parent / "water.webp"
-WORLD, EPISODE = "pour_water", 0
-FRAMES, EVERY, MILLISECONDS, QUALITY = 151, 2, 100, 62  # of the episode; of the animation
+OUT = Path(__file__).resolve().parent / "prediction.webp"
+MODEL, EPISODE = "push_cube_128", 0
+FRAMES, EVERY, MILLISECONDS, QUALITY = 66, 1, 100, 62  # of the episode; of the animation
 LARGEST = 1_000_000  # bytes
 LARGE, SMALL, GIVEN, STRIP, GAP = 480, 288, 160, 24, 12  # pixels
-GETS, PREDICTS = "Given: one frame and the actions", "Predicted by the model, at 64 by 64"
+GETS, PREDICTS = "Given: one frame and the actions", "Predicted by the model, at {0} by {0}"
 INK, PALE, COLOURS = "#1b1d22", "#c4c4c0", ("#2450d8", "#c2560c", "#0b7d63", "#9b2fae")
 FONT = ImageFont.load_default(size=14)
 
@@ -31,11 +31,11 @@ Video = NDArray[np.uint8]  # [T, H, W, 3]
 
 def main() -> None:
     """Simulate in both sizes, predict, compose and write."""
-    run = RunFolder(folder(WORLD))
+    run = RunFolder(folder(MODEL))
     card = DatasetCard.read(run.card)
     given, actions = film(card, {})
     large, _ = film(card, {"size": [LARGE, LARGE]})
-    model = load_run(folder(WORLD)).world_model
+    model = load_run(folder(MODEL)).world_model
     first = torch.from_numpy(given[:1]).permute(0, 3, 1, 2).float() / 255
     predicted = model.rollout(first, torch.from_numpy(actions)[None], check=False)[0]
     made = (255 * predicted.permute(0, 2, 3, 1)).round().byte().numpy()
@@ -81,7 +81,7 @@ def composed(
     titles = (
         (0, 0, f"Simulated, and drawn at {LARGE} by {LARGE}"),
         (right, 0, GETS),
-        (right, low - STRIP, PREDICTS),
+        (right, low - STRIP, PREDICTS.format(len(made))),
     )
     for x, y, text in titles:
         pen.text((x, y + 2), text, fill=INK, font=FONT)

@@ -1,0 +1,111 @@
+"""What the model knows of agents and bodies: their poses on the plane."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from acwm_core.errors import RecipeError, ShapeError
+
+
+class Poses(NamedTuple):
+    """Agents and bodies in one video frame, or with an axis T after B in several.
+
+    Lengths are in units of the model.
+
+    Attributes:
+        agents: places, `[B, A, 2]`.
+        present: 1 for a body that is there and 0 for one that is not, `[B, N, 1]`; without T.
+        places: of the bodies, `[B, N, 2]`.
+        turns: cosine and sine of `folds` times the body's angle, `[B, N, 2]`.
+    """
+
+    agents: Tensor
+    present: Tensor
+    places: Tensor
+    turns: Tensor
+
+
+class Layout:
+    """How the values of the state make poses.
+
+    They are, side by side: the places of the agents (x, y), 1 or 0 for each body that is there or
+    not, the places of the bodies (x, y and perhaps z, in metres) and their angles (rad).
+
+    Args:
+        agents: number of agents A.
+        bodies: number of bodies N.
+        folds: in how many ways a body can be turned and look the same; 4 for a cube.
+        unit: metres that count as one.
+        state_size: number of values; 0 if there are none to learn from.
+
+    Raises:
+        RecipeError: the values cannot be these.
+    """
+
+    def __init__(self, agents: int, bodies: int, folds: int, unit: float, state_size: int) -> None:
+        self.agents, self.bodies, self.folds, self.unit = agents, bodies, folds, unit
+        axes = (state_size - 2 * agents - 2 * bodies) / bodies
+        if state_size and axes not in (2, 3):
+            raise RecipeError(
+                f"data.states has {state_size} values, which are not x and y of {agents} agents, "
+                f"and presence, place and angle of {bodies} bodies: name these fields in this "
+                "order, and set model.agents and model.bodies"
+            )
+        self.axes = int(axes)
+
+    def poses(self, states: Tensor) -> Poses:
+        """The poses in states `[B, T, S]`, as they were recorded."""
+        batch, frames, _ = states.shape
+        sizes = [2 * self.agents, self.bodies, self.axes * self.bodies, self.bodies]
+        if states.shape[2] != sum(sizes):
+            raise ShapeError(f"states have {states.shape[2]} values, not {sum(sizes)}")
+        agents, present, places, angles = states.float().split(sizes, 2)
+        places = places.reshape(batch, frames, self.bodies, self.axes)[..., :2]
+        return Poses(
+            agents.reshape(batch, frames, self.agents, 2) / self.unit,
+            present[:, 0, :, None],
+            places / self.unit,
+            direction(self.folds * angles),
+        )
+
+
+def direction(angle: Tensor) -> Tensor:
+    """Cosine and sine of an angle, side by side in a last axis."""
+    return torch.stack([angle.cos(), angle.sin()], -1)
+
+
+def turned(vector: Tensor, by: Tensor) -> Tensor:
+    """A vector `[…, 2]` turned by the angle whose cosine and sine are `by`, `[…, 2]`."""
+    x, y = vector.unbind(-1)
+    cos, sin = by.unbind(-1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
+
+
+def turned_back(vector: Tensor, by: Tensor) -> Tensor:
+    """The inverse of `turned`: the vector as it is seen in a frame that is turned `by`."""
+    return turned(vector, by * by.new_tensor([1.0, -1.0]))
+
+
+def waves(values: Tensor, octaves: int) -> Tensor:
+    """The values `[…, D]` and their Fourier features, `[…, D (1 + 2 octaves)]`.
+
+    The longest wave has 8 units, and each further one half the length.
+    """
+    lengths = (math.pi / 4) * 2.0 ** torch.arange(octaves, device=values.device)
+    angles = (values[..., None] * lengths).flatten(-2)
+    return torch.cat([values, angles.sin(), angles.cos()], -1)
+
+
+def waves_size(size: int, octaves: int) -> int:
+    """Number of features that `waves` makes of `size` values."""
+    return size * (1 + 2 * octaves)
+
+
+def angle_between(first: Tensor, second: Tensor) -> Tensor:
+    """The angle in rad from one direction `[…, 2]` to another, `[…, 1]`."""
+    cosine, sine = turned_back(second, first).unbind(-1)
+    return torch.atan2(sine, cosine)[..., None]

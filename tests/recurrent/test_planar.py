@@ -1,0 +1,209 @@
+"""Bodies on a plane: poses are read, moved and drawn, each learnt from the truth of the others."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_recurrent.motion import BodyMotion
+from acwm_recurrent.planar import PlanarBodies
+from acwm_recurrent.poses import Layout, Poses, direction, turned, turned_back
+from acwm_recurrent.windows import HORIZONS, moving_windows
+from tests.recurrent.dots import world_of
+
+SMALL = {"channels": 16, "width": 32, "blocks": 1}
+REACH = 1.0
+"""Distance in units below which an agent pushes a puck."""
+
+
+def pucks(clips, seed, frames=17, bodies=2):
+    """Agents that go where they are told, and pucks that they push straight away; as states.
+
+    A push leaves a puck at the distance `REACH` behind which it was met, so that all that happens
+    follows from simple geometry.
+    """
+    random = np.random.default_rng(seed)
+    actions = random.uniform(-1, 1, (clips, frames, 2)).astype(np.float32).repeat(4, 1)[:, :frames]
+    agent = np.zeros((clips, frames, 2))
+    place = np.zeros((clips, frames, bodies, 2))
+    agent[:, 0] = random.uniform(-3, 3, (clips, 2))
+    place[:, 0] = random.uniform(-2, 2, (clips, bodies, 2))
+    for now in range(1, frames):
+        goal = 3 * actions[:, now - 1]
+        agent[:, now] = agent[:, now - 1] + 0.3 * (goal - agent[:, now - 1])
+        apart = place[:, now - 1] - agent[:, now, None]
+        far = np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-6)
+        pushed = agent[:, now, None] + apart / far * REACH
+        place[:, now] = np.where(far < REACH, pushed, place[:, now - 1])
+    present = np.ones((clips, frames, bodies))
+    angles = np.zeros((clips, frames, bodies))
+    parts = [agent, present, place.reshape(clips, frames, -1), angles]
+    return torch.tensor(np.concatenate(parts, -1), dtype=torch.float32), torch.tensor(actions)
+
+
+def model_of_pucks(**parameters):
+    asked = {"latent_channels": 2, "state_size": 10, "temporal_stride": 1, "bodies": 2, "unit": 1.0}
+    return PlanarBodies(**asked | SMALL | {"view": 4.0} | parameters)
+
+
+def test_states_are_poses_in_units():
+    """Two cubes, the second one absent, with z among their coordinates."""
+    states = torch.tensor([[[0.1, -0.2, 1, 0, 0.3, 0.4, 9.0, 0, 0, 9.0, math.pi / 8, 0.0]]])
+    poses = Layout(1, 2, 4, 0.1, 12).poses(states)
+    torch.testing.assert_close(poses.agents, torch.tensor([[[[1.0, -2.0]]]]))
+    torch.testing.assert_close(poses.places[0, 0, 0], torch.tensor([3.0, 4.0]))
+    torch.testing.assert_close(poses.turns[0, 0], torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+    assert poses.present[0, :, 0].tolist() == [1, 0]
+    with pytest.raises(RecipeError, match="not x and y of 1 agents, and presence"):
+        Layout(1, 2, 4, 0.1, 11)
+    with pytest.raises(ShapeError, match="9 values, not 12"):
+        Layout(1, 2, 4, 0.1, 12).poses(states[..., :9])
+    with pytest.raises(RecipeError, match="must be positive"):
+        model_of_pucks(blocks=0)
+
+
+def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():
+    """Where a frame looks from makes no difference: only walls are tied to the plane."""
+    torch.manual_seed(0)
+    motion = BodyMotion(16, folds=4)
+    torch.nn.init.normal_(motion.out.weight)
+    with torch.no_grad():
+        motion.own.weight[:, 1:5] = 0  # what tells of the place and the heading
+        motion.own.weight[:, 8:-1] = 0
+    angles = torch.rand(1, 3) * 0.2
+    places = torch.randn(1, 3, 2)
+    there = torch.tensor([1.0, 1.0, 0.0])[None, :, None]
+    still = torch.zeros(1, 3, 2), torch.zeros(1, 3, 1)
+
+    def moved(by, *, third=0.0):
+        turn = direction(torch.tensor(by))
+        here = places + third * torch.tensor([0.0, 0.0, 1.0])[None, :, None]
+        poses = Poses(
+            turned(torch.ones(1, 1, 2), turn),
+            there,
+            turned(here, turn),
+            direction(4 * (angles + by)),
+        )
+        change = motion(poses, turned(torch.tensor([[[1.2, 0.9]]]), turn), *still)[2]
+        return turned_back(change, turn)
+
+    first = moved(0.0)
+    assert first[0, :2].abs().min() > 0
+    assert first[0, 2].abs().max() == 0
+    torch.testing.assert_close(first, moved(0.5), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(first, moved(0.0, third=3.0))
+
+
+def test_it_learns_how_agents_push_bodies():
+    """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
+    model = model_of_pucks(channels=48)
+    world = world_of(model, stride=1, states=10)
+    optimizer = torch.optim.AdamW(world.parameters(), 3e-3)
+    random = torch.Generator().manual_seed(0)
+    states, actions = pucks(256, seed=0)
+    for step in range(200):
+        rows = torch.randint(256, (64,), generator=random)
+        optimizer.zero_grad()
+        loss = world.motion_loss(actions[rows], states[rows], random, progress=step / 200)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(world.parameters(), 0.5)
+        optimizer.step()
+    states, actions = pucks(64, seed=1)
+    with torch.no_grad():
+        told = model.agent_motion.told(
+            world.conditioner.condition(world.normalise(actions), 17, model.width).modulation
+        )
+        true = model.layout.poses(states)
+        start = Poses(true.agents[:, 0], true.present, true.places[:, 0], true.turns[:, 0])
+        moving = model._begun(
+            start,
+            *(
+                torch.zeros_like(each)
+                for each in (start.agents, start.places, start.places[..., :1])
+            ),
+        )
+        for frame in range(1, 17):
+            moving = model._moved(moving, told[:, frame])
+    moved = (true.places[:, -1] - true.places[:, 0]).norm(dim=-1)
+    error = (moving.poses.places - true.places[:, -1]).norm(dim=-1)
+    assert moved.mean() > 0.3
+    assert error.mean() < 0.6 * moved.mean()
+
+
+def test_windows_are_of_what_moves():
+    states, _ = pucks(64, seed=3)
+    true = model_of_pucks().layout.poses(states)
+    random = torch.Generator().manual_seed(0)
+    for progress, horizon in ((0.0, HORIZONS[0][1]), (1.0, 16)):
+        window, (change, spin) = moving_windows(true, random, progress, folds=4)
+        assert window.places.shape[1] == horizon + 1
+        moves = window.places.diff(dim=1).abs().sum((1, 2, 3)) > 0
+        assert moves.float().mean() > 0.6
+        assert spin.abs().max() == 0
+    whole = (true.places[:, 0] - window.places[:1, 0]).abs().sum((1, 2)).argmin()
+    torch.testing.assert_close(window.places[0], true.places[whole])
+    assert change[0].abs().max() == 0  # before the first frame, everything stands
+
+
+def test_it_draws_what_it_is_told_and_learns_nothing_of_motion_by_it():
+    torch.manual_seed(0)
+    model = model_of_pucks()
+    torch.nn.init.normal_(model.drawing.out.weight)
+    states, _ = pucks(2, seed=0)
+    given, modulation = torch.randn(2, 1, 2, 8, 8), torch.randn(2, 17, 32)
+    conditioning = Conditioning(modulation, None, None)
+    drawn = model(given, conditioning, 17, states=states)
+    drawn.square().mean().backward()
+    idle = [
+        *model.sight.parameters(),
+        *model.agent_motion.parameters(),
+        *model.body_motion.parameters(),
+    ]
+    assert all(each.grad is None for each in idle)
+    other = states.clone()
+    other[:, 9, :2] += 1
+    changed = (model(given, conditioning, 17, states=other) - drawn).abs().amax((0, 2, 3, 4))
+    assert changed.nonzero().flatten().tolist() == [8]  # frame 9 is the 9th after the given one
+    with pytest.raises(RecipeError, match="conditioner=adaln"):
+        model(given, Conditioning(None, None, None), 17)
+    with pytest.raises(ShapeError, match="takes latents"):
+        model.start(given[:, :, :1])
+
+
+def test_it_finds_what_a_picture_shows():
+    """A dot that is drawn at an agent's place, in a channel of its own, and one for each body."""
+    torch.manual_seed(0)
+    model = model_of_pucks(latent_channels=3)
+    optimizer = torch.optim.AdamW(model.sight.parameters(), 3e-3)
+    cells = model._cells(torch.zeros(1, 3, 8, 8))
+
+    def pictures(clips, seed):
+        states, _ = pucks(clips, seed, frames=2)
+        true = model.layout.poses(states)
+        things = torch.cat([true.agents, true.places], 2)[:, 0]
+        return torch.exp(-(things[:, :, None] - cells).square().sum(-1)).unflatten(
+            2, (8, 8)
+        ), things
+
+    for step in range(150):
+        frames, things = pictures(64, step)
+        seen, _ = model.sight(frames, cells)
+        optimizer.zero_grad()
+        functional.mse_loss(torch.cat([seen.agents, seen.places], 1), things).backward()
+        optimizer.step()
+    frames, things = pictures(64, 1000)
+    seen, _ = model.sight(frames, cells)
+    assert (torch.cat([seen.agents, seen.places], 1) - things).norm(dim=-1).mean() < 0.3
+
+
+def test_two_given_frames_tell_how_things_move():
+    torch.manual_seed(0)
+    model = model_of_pucks(latent_channels=3).eval()
+    moving = model.start(torch.randn(1, 2, 3, 8, 8)).moving
+    still = model.start(torch.randn(1, 1, 3, 8, 8)).moving
+    assert moving.place_change.abs().min() > 0
+    assert still.place_change.abs().max() == still.spin.abs().max() == 0
