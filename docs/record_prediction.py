@@ -18,7 +18,7 @@ from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.shipped import folder
 
 OUT = Path(__file__).resolve().parent / "prediction.webp"
-MODEL, EPISODE = "push_cube_128", 0
+MODEL, EPISODE = "push_cube", 0
 FRAMES, EVERY, MILLISECONDS, QUALITY = 66, 1, 100, 62  # of the episode; of the animation
 LARGEST = 1_000_000  # bytes
 LARGE, SMALL, GIVEN, STRIP, GAP = 480, 288, 160, 24, 12  # pixels

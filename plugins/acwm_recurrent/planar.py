@@ -17,7 +17,7 @@ from acwm_core.model.shapes import Latent
 from acwm_recurrent.drawing import Drawing
 from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.motion import HIDDEN, AgentMotion, BodyMotion, Moving
-from acwm_recurrent.poses import Layout, Poses, angle_between, direction, turned, turned_back
+from acwm_recurrent.poses import Layout, Poses, angle_between, direction, turned_back
 from acwm_recurrent.sight import Sight, pose_loss, sight_loss
 from acwm_recurrent.windows import moving_windows
 
@@ -28,12 +28,7 @@ FOLLOWED = 32
 """Clips of a step of `motion_loss` in which agents are followed; they learn fast."""
 
 START_NOISE = 0.01
-"""Noise on the true places from which agents are followed, in units."""
-
-OFF = 0.12
-"""Most noise on the true poses from which bodies are moved, in units and rad; in most windows it is
-far less. Its own small errors put bodies into each other, where they never are in the data; so it
-learns to push them out (as in Sanchez-Gonzalez et al. 2020, arXiv 2002.09405)."""
+"""Noise on the true poses that motion is learned from, in units and rad."""
 
 
 class Scene(NamedTuple):
@@ -270,14 +265,8 @@ class PlanarBodies(Predictor):
         """The error of the bodies in a window `[B, 1 + H, …]`, given how they moved before it."""
         there = window.present
         poses = _at(window, 0)
-        shape = *there.shape[:2], 3
-        noise = torch.randn(shape, generator=random)
-        noise *= OFF * torch.rand(len(there), 1, 1, generator=random) ** 3
-        noise = sent(noise, poses.places) * there
-        poses = poses._replace(
-            places=poses.places + noise[..., :2],
-            turns=turned(poses.turns, direction(self.layout.folds * noise[..., 2])),
-        )
+        noise = sent(torch.randn(poses.places.shape, generator=random), poses.places)
+        poses = poses._replace(places=poses.places + START_NOISE * noise * there)
         change, spin = changes
         loss = poses.places.new_zeros(())
         for number in range(1, window.places.shape[1]):

@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from acwm_core.data.generate import generate
+from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from acwm_core.recipe.compose import recipe_names
@@ -70,13 +72,31 @@ def data_of(tmp_path_factory):
         ("push_cube_small", ("codec=identity",)),
         ("push_cube_small", ("objective=diffusion_forcing",)),
         ("push_cube", ("+small", "+recurrent")),
-        ("push_cube", ("+small", "+recurrent", "+planar_bodies", "training.agent_steps=2")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )
 def test_two_real_steps(recipe, words, data_of, tmp_path):
     environment = compose(recipe, words).env
     data = data_of(environment.name if environment else "push_cube")
+    takes_two_steps(recipe, words, data, tmp_path)
+
+
+def test_two_real_steps_on_poses(tmp_path):
+    """Recordings have no poses, so these are simulated."""
+    data = tmp_path / "data"
+    generate("push_cube", data, episodes={"train": 3}, size=(64, 64), workers=0, progress=False)
+    words = ("+small", "+recurrent", "+planar_bodies", "training.agent_steps=2")
+    takes_two_steps("push_cube", words, data, tmp_path)
+    with pytest.raises(RecipeError, match="model=planar_bodies learns from states: name them"):
+        takes_two_steps(
+            "push_cube",
+            (*words, "data.states=[]", "training.agent_steps=0"),
+            data,
+            tmp_path / "other",
+        )
+
+
+def takes_two_steps(recipe, words, data, tmp_path):
     chosen = compose(recipe, [*words, f"data.path={data}", *SMALL_STEPS])
     run = fit(chosen, tmp_path / "run")
     rows = [row for row in csv.DictReader((run / "metrics.csv").open()) if row["train/loss"]]

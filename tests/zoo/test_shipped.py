@@ -38,10 +38,9 @@ def test_it_says_how_it_was_made_and_how_good_it_is(name):
     facts, summary = read_metadata(RunFolder(folder(name)).weights), Summary.read(folder(name))
     assert facts["cpu_seconds"] > 0
     assert summary.provenance["training_steps"] == facts["step"]
-    assert {split: each.scores.episodes for split, each in summary.splits.items()} == {
-        "ind_test": 64,
-        "ood_test": 64,
-    }
+    least = 16 if name == "push_cube_128" else 64  # large frames take long
+    scored = {split: each.scores.episodes for split, each in summary.splits.items()}
+    assert scored == {"ind_test": least, "ood_test": least}
     assert about(name)
 
 
