@@ -89,7 +89,7 @@ def composed(
     picture.paste(_enlarged(given, GIVEN), (right, STRIP))
     picture.paste(_enlarged(made, SMALL), (right, low))
     left, width, height = right + GIVEN + GAP, SMALL - GIVEN - GAP, GIVEN / shares.shape[1]
-    for index, colour in enumerate(COLOURS):
+    for index, colour in enumerate(COLOURS[: shares.shape[1]]):
         x = left + np.arange(len(shares)) / len(shares) * width
         y = STRIP + height * (index + 0.1 + 0.8 * shares[:, index])
         pen.line([*zip(x.tolist(), y.tolist(), strict=True)], fill=PALE)
