@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,7 +16,18 @@ from acwm_core.model.shapes import Latent
 from acwm_recurrent.drawing import Drawing
 from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.motion import HIDDEN, AgentMotion, BodyMotion, Moving
-from acwm_recurrent.poses import Layout, Poses, angle_between, direction, turned_back
+from acwm_recurrent.poses import (
+    Layout,
+    Poses,
+    angle_between,
+    direction,
+    flattened,
+    history,
+    later,
+    pose_at,
+    stacked,
+    turned_back,
+)
 from acwm_recurrent.sight import Sight, pose_loss, sight_loss
 from acwm_recurrent.windows import moving_windows
 
@@ -134,12 +144,12 @@ class PlanarBodies(Predictor):
             true = self.layout.poses(states)
             now = (known - 1) * self.stride
             last = torch.full((len(base), 1), now, device=base.device)
-            canvas = self.drawing.canvas(base, _flat(_history(true, last, self.stride)), cells)
-            course = _later(true, now)
+            canvas = self.drawing.canvas(base, flattened(history(true, last, self.stride)), cells)
+            course = later(true, now)
         numbers = torch.arange(1, frames - known + 1, device=base.device).expand(len(base), -1)
         if only is not None:
             numbers = numbers.gather(1, only)
-        shown = _flat(_history(course, numbers * self.stride, self.stride))
+        shown = flattened(history(course, numbers * self.stride, self.stride))
         canvas = canvas[:, None].expand(-1, numbers.shape[1], -1, -1, -1).flatten(0, 1)
         changes = self.drawing(canvas, shown, cells)
         return base[:, None] + changes.unflatten(0, numbers.shape)
@@ -161,7 +171,7 @@ class PlanarBodies(Predictor):
         before = self.sight(given[:, -2], cells)[0] if given.shape[1] > 1 else now
         moving = self._begun(now, *(each / self.stride for each in self._changes(before, now)))
         past = [self._earlier(moving, number) for number in range(self.stride)]
-        return Scene(base, self.drawing.canvas(base, _stacked(past), cells), moving)
+        return Scene(base, self.drawing.canvas(base, stacked(past), cells), moving)
 
     def step(self, scene: Scene, told: Tensor) -> tuple[Scene, Poses]:
         """One latent frame later, and the poses in its video frames `[B, stride, …]`, last first.
@@ -174,7 +184,7 @@ class PlanarBodies(Predictor):
         for action in told.unbind(1):
             moving = self._moved(moving, action)
             passed.insert(0, moving.poses)
-        return scene._replace(moving=moving), _stacked(passed)
+        return scene._replace(moving=moving), stacked(passed)
 
     def state_loss(self, batch: Batch) -> Tensor:
         """The error of the poses that it reads from frames, and of how it moves them; see `Batch`.
@@ -187,8 +197,8 @@ class PlanarBodies(Predictor):
         read = torch.cat([torch.zeros_like(read[:, :1]), read], 1)
         looked = batch.latents.take_along_dim(read[..., None, None, None], 1).flatten(0, 1)
         seen, logits = self.sight(looked, self._cells(looked))
-        shown = _flat(_history(true, read * self.stride, 1))
-        loss = sight_loss(seen, logits, _at(shown, 0))
+        shown = flattened(history(true, read * self.stride, 1))
+        loss = sight_loss(seen, logits, pose_at(shown, 0))
         if not self.body_motion.out.weight.requires_grad:
             return loss
         random = batch.generators[0]
@@ -240,8 +250,8 @@ class PlanarBodies(Predictor):
         for frame in range(known, frames):
             rows = slice(frame * self.stride, (frame + 1) * self.stride)
             scene, poses = self.step(scene, told[:, rows])
-            passed += [_at(poses, number) for number in reversed(range(self.stride))]
-        return _stacked(passed)
+            passed += [pose_at(poses, number) for number in reversed(range(self.stride))]
+        return stacked(passed)
 
     def _agent_loss(
         self, true: Poses, conditioning: Conditioning, random: torch.Generator
@@ -264,7 +274,7 @@ class PlanarBodies(Predictor):
     ) -> Tensor:
         """The error of the bodies in a window `[B, 1 + H, …]`, given how they moved before it."""
         there = window.present
-        poses = _at(window, 0)
+        poses = pose_at(window, 0)
         noise = sent(torch.randn(poses.places.shape, generator=random), poses.places)
         poses = poses._replace(places=poses.places + START_NOISE * noise * there)
         change, spin = changes
@@ -273,7 +283,7 @@ class PlanarBodies(Predictor):
             agents = window.agents[:, number]
             places, turns, change, spin = self.body_motion(poses, agents, change, spin)
             poses = Poses(agents, there, places, turns)
-            loss = loss + pose_loss(poses, _at(window, number))
+            loss = loss + pose_loss(poses, pose_at(window, number))
         return loss / (window.places.shape[1] - 1)
 
     def _moved(self, moving: Moving, action: Tensor) -> Moving:
@@ -338,43 +348,6 @@ class _PlanarStream(LatentStream):
         """The next latent frame; see `LatentStream.advance`."""
         latent, self._state = self._model.next_state(self._state, conditioning)
         return latent
-
-
-def _history(poses: Poses, last: Tensor, frames: int) -> Poses:
-    """The poses in the `frames` frames until each `last` one `[B, M]`, the last one first.
-
-    `[B, M, frames, …]`; before the first frame, everything stands where it stands then.
-    """
-    numbers = last[..., None] - torch.arange(frames, device=last.device)
-    numbers = numbers.clamp(min=0)
-    rows = torch.arange(len(last), device=last.device)[:, None, None]
-    agents, present, places, turns = poses
-    present = present[:, None].expand(-1, last.shape[1], -1, -1)
-    return Poses(agents[rows, numbers], present, places[rows, numbers], turns[rows, numbers])
-
-
-def _flat(poses: Poses) -> Poses:
-    """The first two axes as one."""
-    return Poses(*(each.flatten(0, 1) for each in poses))
-
-
-def _later(poses: Poses, first: int) -> Poses:
-    agents, present, places, turns = poses
-    return Poses(agents[:, first:], present, places[:, first:], turns[:, first:])
-
-
-def _at(poses: Poses, frame: int) -> Poses:
-    """The poses in one frame of several."""
-    agents, present, places, turns = poses
-    return Poses(agents[:, frame], present, places[:, frame], turns[:, frame])
-
-
-def _stacked(frames: Sequence[Poses]) -> Poses:
-    """Poses of several frames as one, `[B, T, …]`."""
-    agents, _, places, turns = (list(each) for each in zip(*frames, strict=True))
-    return Poses(
-        torch.stack(agents, 1), frames[0].present, torch.stack(places, 1), torch.stack(turns, 1)
-    )
 
 
 def _tensors(scene: Scene) -> tuple[Tensor, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -109,3 +110,41 @@ def angle_between(first: Tensor, second: Tensor) -> Tensor:
     """The angle in rad from one direction `[…, 2]` to another, `[…, 1]`."""
     cosine, sine = turned_back(second, first).unbind(-1)
     return torch.atan2(sine, cosine)[..., None]
+
+
+def history(poses: Poses, last: Tensor, frames: int) -> Poses:
+    """The poses in the `frames` frames until each `last` one `[B, M]`, the last one first.
+
+    `[B, M, frames, …]`; before the first frame, everything stands where it stands then.
+    """
+    numbers = last[..., None] - torch.arange(frames, device=last.device)
+    numbers = numbers.clamp(min=0)
+    rows = torch.arange(len(last), device=last.device)[:, None, None]
+    agents, present, places, turns = poses
+    present = present[:, None].expand(-1, last.shape[1], -1, -1)
+    return Poses(agents[rows, numbers], present, places[rows, numbers], turns[rows, numbers])
+
+
+def flattened(poses: Poses) -> Poses:
+    """The first two axes as one."""
+    return Poses(*(each.flatten(0, 1) for each in poses))
+
+
+def later(poses: Poses, first: int) -> Poses:
+    """The poses from a frame on."""
+    agents, present, places, turns = poses
+    return Poses(agents[:, first:], present, places[:, first:], turns[:, first:])
+
+
+def pose_at(poses: Poses, frame: int) -> Poses:
+    """The poses in one frame of several."""
+    agents, present, places, turns = poses
+    return Poses(agents[:, frame], present, places[:, frame], turns[:, frame])
+
+
+def stacked(frames: Sequence[Poses]) -> Poses:
+    """Poses of several frames as one, `[B, T, …]`."""
+    agents, _, places, turns = (list(each) for each in zip(*frames, strict=True))
+    return Poses(
+        torch.stack(agents, 1), frames[0].present, torch.stack(places, 1), torch.stack(turns, 1)
+    )
