@@ -148,9 +148,9 @@ class Predictor(DynamicsModel):
     which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
     actions move the agent without a picture.
 
-    One that draws pictures from states (`follows_states`) gets them as they were recorded, in every
-    video frame `[B, T, S]`, in `state_loss` and `motion_loss`, and while it is trained, by the
-    further keyword ``states: Tensor | None`` of `forward`. Without them it has to know by itself.
+    One that draws pictures from states (`follows_states`) gets them in every video frame
+    `[B, T, S]`, in `state_loss` and `motion_loss`, and while it is trained, by the further keyword
+    ``states: Tensor | None`` of `forward`. Without them it has to know by itself.
 
     One that saves work if it need not return all frames (`skips`) takes the further keyword
     ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
@@ -159,12 +159,14 @@ class Predictor(DynamicsModel):
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
         skips: whether `forward` takes ``only``.
-        follows_states: whether `forward` takes ``states``, and all states are as recorded.
+        follows_states: whether `forward` takes ``states``, and all are of every video frame.
+        raw_states: whether it takes states as they were recorded, and not scaled to variance 1.
     """
 
     streams: bool = False
     skips: bool = False
     follows_states: bool = False
+    raw_states: bool = False
 
     @abstractmethod
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:

@@ -168,10 +168,12 @@ class WorldModel(nn.Module):
         return self.model.motion_loss(scaled, conditioning, random, progress=progress)
 
     def _scaled(self, states: Tensor | None) -> Tensor | None:
-        """States of a clip's frames, scaled, those of its latent frames; see `Batch.states`."""
-        if states is None or (isinstance(self.model, Predictor) and self.model.follows_states):
+        """States of a clip's frames as the model takes them; see `Batch.states`."""
+        if states is None or not isinstance(self.model, Predictor):
             return states
-        return (states[:, :: self.codec.temporal_stride] - self.state_mean) / self.state_std
+        if not self.model.follows_states:
+            states = states[:, :: self.codec.temporal_stride]
+        return states if self.model.raw_states else (states - self.state_mean) / self.state_std
 
     def rollout(
         self,

@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.errors import RecipeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import LatentStream, Predictor
 from acwm_core.model.objectives.objective import Batch, sent
 from acwm_core.model.shapes import Latent
 from acwm_recurrent.drawing import Drawing
-from acwm_recurrent.layers import MatrixConv
 from acwm_recurrent.motion import HIDDEN, AgentMotion, BodyMotion, Moving
 from acwm_recurrent.poses import (
     Layout,
@@ -28,6 +26,7 @@ from acwm_recurrent.poses import (
     stacked,
     turned_back,
 )
+from acwm_recurrent.scene import SceneModel
 from acwm_recurrent.sight import Sight, pose_loss, sight_loss
 from acwm_recurrent.windows import moving_windows
 
@@ -55,18 +54,17 @@ class Scene(NamedTuple):
     moving: Moving
 
 
-class PlanarBodies(Predictor):
+class PlanarBodies(SceneModel[Scene, Poses]):
     """Reads the poses of agents and bodies from the given frame, moves them, and draws them.
 
-    The picture is no part of what is carried from frame to frame: a body that moves wrongly is in
-    the wrong place, and as solid as before. It is for a camera that looks down on a plane, bodies
-    that keep their colours, number k the same one in all episodes, and data that hold their poses:
+    A body that moves wrongly is in the wrong place, and as solid as before. It is for a camera that
+    looks down on a plane, bodies that keep their colours, number k the same one in all episodes,
+    and data that hold their poses:
 
         data.states=[pusher_position,cube_present,cube_position,cube_yaw]
 
     in this order: places of the agents, presence, places and angles of the bodies (see `Layout`).
-    `training.agent_steps` teaches how they move, without pictures. While it learns to draw, it
-    draws what is truly there (teacher forcing).
+    `training.agent_steps` teaches how they move, without pictures.
 
     Args:
         latent_channels: channels C of the codec.
@@ -85,8 +83,8 @@ class PlanarBodies(Predictor):
         RecipeError: a size below 1, or states that are not these.
     """
 
-    layers, heads = 0, 1
-    causal = streams = skips = follows_states = True
+    name = "planar_bodies"
+    raw_states = True
 
     def __init__(
         self,
@@ -103,11 +101,10 @@ class PlanarBodies(Predictor):
         width: int = 192,
         blocks: int = 4,
     ) -> None:
-        super().__init__()
+        super().__init__(latent_channels, temporal_stride, width)
         if min(agents, bodies, folds, channels, width, blocks) < 1 or min(unit, view) <= 0:
             raise RecipeError("all parameters of planar_bodies must be positive")
         self.layout = Layout(agents, bodies, folds, unit, state_size)
-        self.latent_channels, self.stride, self.width = latent_channels, temporal_stride, width
         self.view = view / unit
         self.sight = Sight(latent_channels, agents, bodies, channels)
         self.agent_motion = AgentMotion(agents, width, temporal_stride)
@@ -122,50 +119,9 @@ class PlanarBodies(Predictor):
             blocks=blocks,
         )
 
-    def forward(
-        self,
-        given: Latent,
-        conditioning: Conditioning,
-        frames: int,
-        *,
-        only: Tensor | None = None,
-        states: Tensor | None = None,
-    ) -> Latent:
-        """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
-
-        With `only`, those of them; with `states`, it draws true poses instead of its own.
-        """
-        known, base = given.shape[1], given[:, -1]
-        cells = self._cells(base)
-        if states is None:
-            scene = self.start(given)
-            canvas, course = scene.canvas, self._followed(scene, conditioning, known, frames)
-        else:
-            true = self.layout.poses(states)
-            now = (known - 1) * self.stride
-            last = torch.full((len(base), 1), now, device=base.device)
-            canvas = self.drawing.canvas(base, flattened(history(true, last, self.stride)), cells)
-            course = later(true, now)
-        numbers = torch.arange(1, frames - known + 1, device=base.device).expand(len(base), -1)
-        if only is not None:
-            numbers = numbers.gather(1, only)
-        shown = flattened(history(course, numbers * self.stride, self.stride))
-        canvas = canvas[:, None].expand(-1, numbers.shape[1], -1, -1, -1).flatten(0, 1)
-        changes = self.drawing(canvas, shown, cells)
-        return base[:, None] + changes.unflatten(0, numbers.shape)
-
     def start(self, given: Latent) -> Scene:
-        """What is known after the last of the given frames `[B, K, C, h, w]`.
-
-        Raises:
-            ShapeError: the latents have another number of channels.
-        """
-        if given.ndim != 5 or given.shape[2] != self.latent_channels:
-            raise ShapeError(
-                f"PlanarBodies takes latents [B, L, {self.latent_channels}, h, w], "
-                f"not {list(given.shape)}"
-            )
-        base = given[:, -1]
+        """What is known after the last of the given frames; see `SceneModel.start`."""
+        base = self.checked(given)[:, -1]
         cells = self._cells(base)
         now, _ = self.sight(base, cells)
         before = self.sight(given[:, -2], cells)[0] if given.shape[1] > 1 else now
@@ -174,12 +130,7 @@ class PlanarBodies(Predictor):
         return Scene(base, self.drawing.canvas(base, stacked(past), cells), moving)
 
     def step(self, scene: Scene, told: Tensor) -> tuple[Scene, Poses]:
-        """One latent frame later, and the poses in its video frames `[B, stride, …]`, last first.
-
-        Args:
-            scene: after the previous latent frame.
-            told: actions of its video frames, `[B, stride, A, ACTION]`, see `AgentMotion.told`.
-        """
+        """One latent frame later, and the poses in its video frames, `[B, stride, …]`."""
         moving, passed = scene.moving, list[Poses]()
         for action in told.unbind(1):
             moving = self._moved(moving, action)
@@ -223,42 +174,54 @@ class PlanarBodies(Predictor):
             window, changes = moving_windows(true, random, progress, self.layout.folds)
             return followed + self._body_loss(window, changes, random)
 
-    def stream(self, given: Latent, *, context: int) -> LatentStream:
-        """Stream from the poses. `context` is ignored, as the scene holds all that is known."""
-        return _PlanarStream(self, given)
+    def told(self, embedded: Tensor) -> Tensor:
+        """Embedded actions by agents and video frames; see `AgentMotion.told`."""
+        return self.agent_motion.told(embedded)
 
-    def matrices(self) -> list[nn.Parameter]:
-        """The weights of the convolutions in the blocks and in the head that draw."""
-        return [each.weight for each in self.drawing.modules() if isinstance(each, MatrixConv)]
+    def drawn(self, scene: Scene, shown: Poses) -> Tensor:
+        """The latent frame of poses in its video frames `[B, stride, …]`, the last one first."""
+        return scene.base + self.drawing(scene.canvas, shown, self._cells(scene.base))
 
-    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
-        """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors."""
-        return _tensors(self.start(given))
+    def true_course(self, given: Latent, states: Tensor) -> tuple[Scene, Poses]:
+        """The true poses from the last given frame on."""
+        true, now = self.layout.poses(states), (given.shape[1] - 1) * self.stride
+        last = torch.full((len(given), 1), now, device=given.device)
+        base, past = given[:, -1], flattened(history(true, last, self.stride))
+        canvas = self.drawing.canvas(base, past, self._cells(base))
+        still = (torch.zeros_like(each[:, 0]) for each in (true.agents, true.places))
+        spin = torch.zeros_like(true.places[:, 0, :, :1])
+        return Scene(base, canvas, self._begun(pose_at(true, now), *still, spin)), later(true, now)
 
-    def next_state(
-        self, state: tuple[Tensor, ...], conditioning: Conditioning
-    ) -> tuple[Latent, tuple[Tensor, ...]]:
-        """The next latent frame `[B, 1, C, h, w]` and its state, given the last conditioning."""
-        told = self._told(conditioning)[:, -self.stride :]
-        scene, poses = self.step(_scene(state), told)
-        frame = scene.base + self.drawing(scene.canvas, poses, self._cells(scene.base))
-        return frame[:, None], _tensors(scene)
+    def joined(self, scene: Scene, passed: list[Poses]) -> Poses:
+        """The poses in all video frames from that of the scene on, `[B, 1 + T, …]`."""
+        frames = [pose_at(each, k) for each in passed for k in reversed(range(self.stride))]
+        return stacked([scene.moving.poses, *frames])
 
-    def _followed(self, scene: Scene, conditioning: Conditioning, known: int, frames: int) -> Poses:
-        """Its own poses in all video frames after the given ones, `[B, T, …]`, and before them."""
-        told, passed = self._told(conditioning), [scene.moving.poses]
-        for frame in range(known, frames):
-            rows = slice(frame * self.stride, (frame + 1) * self.stride)
-            scene, poses = self.step(scene, told[:, rows])
-            passed += [pose_at(poses, number) for number in reversed(range(self.stride))]
-        return stacked(passed)
+    def drawn_course(self, scene: Scene, course: Poses, numbers: Tensor) -> Latent:
+        """The latent frames with these numbers; see `SceneModel.drawn_course`."""
+        shown = flattened(history(course, numbers * self.stride, self.stride))
+        base, canvas = (
+            each.repeat_interleave(numbers.shape[1], 0) for each in (scene.base, scene.canvas)
+        )
+        frames = self.drawn(scene._replace(base=base, canvas=canvas), shown)
+        return frames.unflatten(0, numbers.shape)
+
+    def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
+        """The scene as tensors."""
+        poses, *changes = scene.moving
+        return (scene.base, scene.canvas, *poses, *changes)
+
+    def scene(self, state: tuple[Tensor, ...]) -> Scene:
+        """The inverse of `tensors`."""
+        base, canvas, *rest = state
+        return Scene(base, canvas, Moving(Poses(*rest[:4]), *rest[4:]))
 
     def _agent_loss(
         self, true: Poses, conditioning: Conditioning, random: torch.Generator
     ) -> Tensor:
         chosen = torch.randperm(len(true.agents), generator=random)[:FOLLOWED]
         agents = true.agents[chosen.to(true.agents.device)]
-        told = self._told(conditioning)[chosen.to(agents.device)]
+        told = self.told_of(conditioning)[chosen.to(agents.device)]
         noise = sent(torch.randn(agents[:, 0].shape, generator=random), agents)
         place, passed = agents[:, 0] + START_NOISE * noise, list[Tensor]()
         change = torch.zeros_like(place)
@@ -328,33 +291,3 @@ class PlanarBodies(Predictor):
         )
         y, x = torch.meshgrid(-rows, columns, indexing="ij")
         return torch.stack([x, y], -1).flatten(0, 1)
-
-    def _told(self, conditioning: Conditioning) -> Tensor:
-        if conditioning.modulation is None:
-            raise RecipeError(
-                "planar_bodies takes actions as a modulation, which this conditioner does not "
-                "give: set conditioner=adaln"
-            )
-        return self.agent_motion.told(conditioning.modulation)
-
-
-class _PlanarStream(LatentStream):
-    """A stream that carries the scene."""
-
-    def __init__(self, model: PlanarBodies, given: Latent) -> None:
-        self._model, self._state = model, _tensors(model.start(given))
-
-    def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame; see `LatentStream.advance`."""
-        latent, self._state = self._model.next_state(self._state, conditioning)
-        return latent
-
-
-def _tensors(scene: Scene) -> tuple[Tensor, ...]:
-    poses, *changes = scene.moving
-    return (scene.base, scene.canvas, *poses, *changes)
-
-
-def _scene(state: tuple[Tensor, ...]) -> Scene:
-    base, canvas, *rest = state
-    return Scene(base, canvas, Moving(Poses(*rest[:4]), *rest[4:]))

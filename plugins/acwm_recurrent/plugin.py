@@ -18,6 +18,12 @@ def register_models(registry: Registry) -> None:
         summary="1 M parameters: moves the poses of bodies on a table, and draws them",
         objective="regression",
     )
+    registry.add(
+        "drawn_states",
+        "acwm_recurrent.drawn:DrawnStates",
+        summary="3 M parameters: moves the states of a robot and of what it holds, and draws them",
+        objective="regression",
+    )
 
 
 @hookimpl

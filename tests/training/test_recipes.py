@@ -81,15 +81,18 @@ def test_two_real_steps(recipe, words, data_of, tmp_path):
     takes_two_steps(recipe, words, data, tmp_path)
 
 
-def test_two_real_steps_on_poses(tmp_path):
-    """Recordings have no poses, so these are simulated."""
+@pytest.mark.parametrize(
+    ("world", "model"), [("push_cube", "planar_bodies"), ("robot_arm", "drawn_states")]
+)
+def test_two_real_steps_on_states(world, model, tmp_path):
+    """The recordings have no states, so these are simulated."""
     data = tmp_path / "data"
-    generate("push_cube", data, episodes={"train": 3}, size=(64, 64), workers=0, progress=False)
-    words = ("+small", "+recurrent", "+planar_bodies", "training.agent_steps=2")
-    takes_two_steps("push_cube", words, data, tmp_path)
-    with pytest.raises(RecipeError, match="model=planar_bodies learns from states: name them"):
+    generate(world, data, episodes={"train": 3}, size=(64, 64), workers=0, progress=False)
+    words = ("+small", "+recurrent", f"+{model}", "training.agent_steps=2")
+    takes_two_steps(world, words, data, tmp_path)
+    with pytest.raises(RecipeError, match=f"model={model} learns from states: name them"):
         takes_two_steps(
-            "push_cube",
+            world,
             (*words, "data.states=[]", "training.agent_steps=0"),
             data,
             tmp_path / "other",

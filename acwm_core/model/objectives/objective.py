@@ -27,8 +27,9 @@ class Batch:
         conditioning: the embedded actions of whole clips.
         generators: one CPU generator per clip, the only source of randomness.
         states: the agent's states in each latent frame, to learn from, `[B, L, S]`, each value with
-            mean 0 and deviation 1 over the training data; None if there are none. For a model that
-            follows them (`Predictor.follows_states`), as recorded, in each video frame.
+            mean 0 and deviation 1 over the training data, but for a model that takes raw ones
+            (`Predictor.raw_states`); of each video frame, if it follows them
+            (`Predictor.follows_states`). None if there are none.
     """
 
     latents: Latent
