@@ -10,6 +10,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from acwm_core.data.clips import ClipDataset, DataConfig, hold_out, take_fraction
@@ -24,6 +25,9 @@ NOT_RESUMABLE = (
     "data.reader=webdataset cannot continue exactly: a resumed run sees the clips in another order "
     "than one that was not interrupted; data.reader=random_access resumes with the very next clip"
 )
+
+ROUNDING = 1e-6
+"""Share of the largest value of a field by which float32 and a solver move what stands still."""
 
 
 class ClipData(L.LightningDataModule):
@@ -75,13 +79,17 @@ class ClipData(L.LightningDataModule):
     def state_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the states to learn, `[S]` each, over training episodes.
 
-        Of a value that never changes, the deviation is one.
+        Of a value that never changes, or by the rounding of its field alone, the deviation is one.
         """
-        names = self.config.states
-        rows = np.concatenate([self.episodes.states(each, names) for each in self._split[0]])
-        mean, std = rows.mean(0, dtype=np.float64), rows.std(0, dtype=np.float64)
-        std[std < 1e-6 * np.abs(mean) + 1e-12] = 1
+        scales = [self._scale_of(name) for name in self.config.states]
+        mean, std = (np.concatenate(each) for each in zip(*scales, strict=True))
         return torch.tensor(mean, dtype=torch.float32), torch.tensor(std, dtype=torch.float32)
+
+    def _scale_of(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        rows = np.concatenate([self.episodes.states(each, [name]) for each in self._split[0]])
+        mean, std = rows.mean(0, dtype=np.float64), rows.std(0, dtype=np.float64)
+        std[std <= ROUNDING * max(np.abs(mean).max(), std.max())] = 1
+        return mean, std
 
     def _divided(self) -> tuple[Sequence[int], range]:
         """The episodes to train on, and those that are held out."""

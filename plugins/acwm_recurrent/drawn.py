@@ -53,13 +53,15 @@ class DrawnStates(SceneModel[Scene, Tensor]):
     Args:
         latent_channels: channels C of the codec.
         state_size: number of values S of the states.
+        following: how many of the states, the last ones, follow from the others in every frame, as
+            a hand's place does from the angles of joints. Their errors do not add up.
         temporal_stride: video frames per latent frame of the codec.
         channels: size of the grid that is drawn on.
         width: size of the conditioner's modulation, and of what the blocks are told.
         blocks: number of residual blocks that draw.
 
     Raises:
-        RecipeError: a size below 1.
+        RecipeError: a size below 1, or no states that others could follow from.
     """
 
     name = "drawn_states"
@@ -69,6 +71,7 @@ class DrawnStates(SceneModel[Scene, Tensor]):
         *,
         latent_channels: int,
         state_size: int = 1,
+        following: int = 0,
         temporal_stride: int = 4,
         channels: int = 96,
         width: int = 192,
@@ -77,8 +80,13 @@ class DrawnStates(SceneModel[Scene, Tensor]):
         super().__init__(latent_channels, temporal_stride, width)
         if min(channels, width, blocks) < 1:
             raise RecipeError("channels, width and blocks of drawn_states must be at least 1")
+        if not 0 <= following < state_size:
+            raise RecipeError(
+                f"model.following={following} of the {state_size} values of data.states follow "
+                f"from the others: give 0 to {state_size - 1}"
+            )
         self.sight = StateSight(latent_channels, state_size, channels)
-        self.motion = StateMotion(state_size, width, temporal_stride)
+        self.motion = StateMotion(state_size, following, width, temporal_stride)
         self.drawing = StateDrawing(
             latent_channels,
             state_size,

@@ -79,18 +79,30 @@ class StateMotion(nn.Module):
 
     Args:
         states: number of values S.
+        following: how many of them, the last ones, follow from the others in every frame.
         width: size of the embedded actions.
         stride: video frames per latent frame, whose actions are embedded together.
     """
 
-    def __init__(self, states: int, width: int, stride: int) -> None:
+    def __init__(self, states: int, following: int, width: int, stride: int) -> None:
         super().__init__()
-        self.stride = stride
+        self.moved = states - following
         self.actions = nn.Linear(width, stride * ACTION)
         self.start = nn.Linear(states, HIDDEN)
         self.gru = nn.GRUCell(ACTION + states, HIDDEN)
         self.change = nn.Sequential(
-            nn.Linear(HIDDEN + ACTION + states, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, states)
+            nn.Linear(HIDDEN + ACTION + states, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, self.moved)
+        )
+        self.follow = (
+            nn.Sequential(
+                nn.Linear(self.moved, HIDDEN),
+                nn.SiLU(),
+                nn.Linear(HIDDEN, HIDDEN),
+                nn.SiLU(),
+                nn.Linear(HIDDEN, following),
+            )
+            if following
+            else None
         )
 
     def told(self, embedded: Tensor) -> Tensor:
@@ -110,7 +122,9 @@ class StateMotion(nn.Module):
         """The states `[B, S]` one video frame later, and the hidden state."""
         inputs = torch.cat([action, states], -1)
         hidden = self.gru(inputs, hidden)
-        return states + STEP * self.change(torch.cat([hidden, inputs], -1)), hidden
+        change = STEP * self.change(torch.cat([hidden, inputs], -1))
+        moved = states[..., : self.moved] + change
+        return (torch.cat([moved, self.follow(moved)], -1) if self.follow else moved), hidden
 
 
 class StateDrawing(nn.Module):

@@ -52,8 +52,9 @@ def pack(
         run: a finished run.
         out: the folder to create.
         name: name by which the model will be used; that of the folder by default.
-        overrides: overrides of the evaluation, as in `acwm evaluate`; those of the codec choose
-            another one with the same latents.
+        overrides: overrides of the evaluation, as in `acwm evaluate`, which the packed recipe
+            keeps, so that its scores can be made again; those of the codec choose another one with
+            the same latents.
         data: the dataset to evaluate on; that of the recipe by default.
 
     Raises:
@@ -68,6 +69,7 @@ def pack(
     recipe, facts = load_run(run).recipe, read_metadata(folder.weights)
     if codec:
         recipe = _with_codec(recipe, codec, facts["codec"], run)
+    recipe = Recipe.from_dict(with_overrides(recipe.to_dict(), overrides))
     weights = cast(dict[str, torch.Tensor], cast(Any, load_file)(folder.weights))
     with writing(out), made_whole(out) as partial:
         packed = RunFolder(partial)

@@ -37,9 +37,10 @@ def model_of_arms(**parameters):
     return DrawnStates(**asked | {"channels": 16, "width": 32, "blocks": 1} | parameters)
 
 
-def test_it_learns_how_actions_move_states():
+@pytest.mark.parametrize("following", [0, 2])
+def test_it_learns_how_actions_move_states(following):
     """Two hundred steps foretell whole clips of a lag, and where that leads the hand."""
-    model = model_of_arms()
+    model = model_of_arms(following=following)
     world = world_of(model, stride=1, states=4)
     optimizer = torch.optim.AdamW(world.parameters(), 3e-3)
     random = torch.Generator().manual_seed(0)
@@ -106,6 +107,8 @@ def test_it_draws_what_it_is_told_and_learns_nothing_of_motion_by_it():
 def test_what_does_not_fit_is_refused():
     with pytest.raises(RecipeError, match="at least 1"):
         model_of_arms(blocks=0)
+    with pytest.raises(RecipeError, match=r"model\.following=4 of the 4 values"):
+        model_of_arms(following=4)
     model = model_of_arms()
     with pytest.raises(ShapeError, match="DrawnStates takes latents"):
         model.start(torch.zeros(1, 1, 2, 8, 8))

@@ -60,6 +60,23 @@ def test_the_scale_is_that_of_the_training_episodes(data):
     np.testing.assert_allclose(std, rows.std(0), rtol=1e-5)
 
 
+def test_what_moves_by_rounding_alone_is_not_magnified(data, monkeypatch):
+    """The base of an arm, among its links: solvers leave some nanometres."""
+    episodes = EpisodeDataset(data, "train")
+    read = EpisodeDataset.states
+
+    def shaken(self, index, names):
+        rows = read(self, index, names).copy()
+        rows[:, 1] = 1e-9 * np.sin(np.arange(len(rows)))
+        return rows
+
+    monkeypatch.setattr(EpisodeDataset, "states", shaken)
+    config = DataConfig(str(data), states=("position",))
+    _, std = ClipData(config, episodes, TinyCodec(), 0).state_scale()
+    assert std[1] == 1
+    assert std[0] > 2
+
+
 def test_a_killed_run_resumes_with_the_same_states(data, tmp_path, monkeypatch):
     asked = {**LEARNER, "data": PLACES, "training": {"agent_steps": 3}}
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))

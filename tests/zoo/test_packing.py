@@ -265,7 +265,9 @@ def test_a_codec_with_the_same_latents_takes_the_place_of_the_old_one(data, tmp_
         "conditioner": {"name": "adaln"},
     }
     run = tiny.make_run(tmp_path / "run", data, parts=parts, **QUICK, episodes=2)
-    made = pack(run, tmp_path / "made", data=data, overrides=["codec=compact_reference"])
+    words = ["codec=compact_reference", "evaluation.seed=5"]
+    made = pack(run, tmp_path / "made", data=data, overrides=words)
+    assert load_run(made).recipe.evaluation["seed"] == 5  # its scores can be made again
     before, now = load_run(run).world_model, load_run(made).world_model
     assert isinstance(now.codec, CompactReference)
     first, actions = torch.rand(1, 3, 32, 32), torch.zeros(1, 9, 2)
