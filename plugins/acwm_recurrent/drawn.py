@@ -21,6 +21,10 @@ READ_FRAMES = 2
 START_NOISE = 0.03
 """Noise on the true states that motion is learned from, in standard deviations."""
 
+HORIZONS = ((0.35, 8), (0.65, 20))
+"""Until which share of the training motion is learned from windows of so many video frames: the
+same error in a tenth of the time. Then from whole clips, in which errors add up."""
+
 SHOWN_NOISE = 0.02
 """Noise on the true states that drawing is learned from: its own will be that far off."""
 
@@ -125,7 +129,9 @@ class DrawnStates(SceneModel[Scene, Tensor]):
         if not self.motion.gru.weight_hh.requires_grad:
             return loss
         noise = sent(drawn_noise(true.shape[1:], batch.generators), true)
-        return loss + self._motion_loss(batch.states, batch.conditioning, noise)
+        frames = batch.states.shape[1] - 1
+        moved = self._motion_loss(batch.states, batch.conditioning, noise, first=0, frames=frames)
+        return loss + moved
 
     def motion_loss(
         self,
@@ -137,7 +143,10 @@ class DrawnStates(SceneModel[Scene, Tensor]):
     ) -> Tensor:
         """The error of the states that actions lead to from true ones, which are a little off."""
         noise = sent(torch.randn(states[:, 0].shape, generator=random), states)
-        return self._motion_loss(states, conditioning, noise)
+        last = states.shape[1] - 1
+        frames = next((size for until, size in HORIZONS if progress < until and size < last), last)
+        first = int(torch.randint(last - frames + 1, (), generator=random))
+        return self._motion_loss(states, conditioning, noise, first=first, frames=frames)
 
     def told(self, embedded: Tensor) -> Tensor:
         """Embedded actions by video frames; see `StateMotion.told`."""
@@ -180,15 +189,18 @@ class DrawnStates(SceneModel[Scene, Tensor]):
             hidden = self.motion.begin(states)
         return Scene(base, self.drawing.canvas(base, states), states, states, hidden)
 
-    def _motion_loss(self, true: Tensor, conditioning: Conditioning, noise: Tensor) -> Tensor:
-        # By the distance and not its square: what a missed grasp or a collision sends elsewhere
-        # would outweigh all others.
+    def _motion_loss(
+        self, true: Tensor, conditioning: Conditioning, noise: Tensor, *, first: int, frames: int
+    ) -> Tensor:
+        """The error in so many video frames after the first, from a start that is a little off."""
         with torch.autocast(true.device.type, enabled=False):
-            told = self.told_of(conditioning)
-            states, passed = true[:, 0] + START_NOISE * noise, list[Tensor]()
+            told = self.told_of(conditioning)[:, self.stride + first :]
+            states, passed = true[:, first] + START_NOISE * noise, list[Tensor]()
             hidden = self.motion.begin(states)
-            for action in told[:, self.stride :].unbind(1)[: true.shape[1] - 1]:
+            for action in told[:, :frames].unbind(1):
                 states, hidden = self.motion(action, states, hidden)
                 passed.append(states)
-            made = torch.stack(passed, 1)
-            return functional.smooth_l1_loss(made, true[:, 1 : 1 + made.shape[1]], beta=0.05)
+            # By the distance and not its square: what a missed grasp or a collision sends
+            # elsewhere would outweigh all others.
+            later = true[:, first + 1 : first + 1 + frames]
+            return functional.smooth_l1_loss(torch.stack(passed, 1), later, beta=0.05)

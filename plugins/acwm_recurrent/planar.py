@@ -188,9 +188,9 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         last = torch.full((len(given), 1), now, device=given.device)
         base, past = given[:, -1], flattened(history(true, last, self.stride))
         canvas = self.drawing.canvas(base, past, self._cells(base))
-        still = (torch.zeros_like(each[:, 0]) for each in (true.agents, true.places))
-        spin = torch.zeros_like(true.places[:, 0, :, :1])
-        return Scene(base, canvas, self._begun(pose_at(true, now), *still, spin)), later(true, now)
+        begun = pose_at(true, now)
+        moving = self._begun(begun, *self._changes(begun, begun))
+        return Scene(base, canvas, moving), later(true, now)
 
     def joined(self, scene: Scene, passed: list[Poses]) -> Poses:
         """The poses in all video frames from that of the scene on, `[B, 1 + T, …]`."""
