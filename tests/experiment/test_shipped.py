@@ -37,9 +37,9 @@ def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
     made = plan("benchmark/zoo", tmp_path)
     assert made.experiment.groups == plan("benchmark/main", tmp_path).experiment.groups
     assert len(made.runs) == 8
+    kinds = {"push_cube": "planar_bodies", "robot_arm": "drawn_states"}
     for run in made.runs:
-        bodies = run.dataset.environment == "push_cube"
-        assert run.recipe.model.name == ("planar_bodies" if bodies else "recurrent")
+        assert run.recipe.model.name == kinds.get(run.dataset.environment, "recurrent")
         assert str(run.dataset.path) == f"data/{run.dataset.environment}_zoo"
         assert run.dataset.choice.episodes is not None
 
