@@ -11,7 +11,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
-from acwm_core.model.dynamics import DynamicsModel, Predictor
+from acwm_core.model.dynamics import DynamicsModel
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
@@ -102,7 +102,10 @@ def build_model(
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
     fitted = {"latent_channels": latent_channels}
-    takes = signature(catalog().component("model", choice.name).load()).parameters
+    maker = catalog().component("model", choice.name).load()
+    if getattr(maker, "follows_states", False) and not state_size:
+        raise RecipeError(f"model={choice.name} learns from states: name them in data.states")
+    takes = signature(maker).parameters
     if "temporal_stride" in takes:
         fitted["temporal_stride"] = temporal_stride
     if state_size:
@@ -113,8 +116,6 @@ def build_model(
             )
         fitted["state_size"] = state_size
     model = build_component("model", choice, DynamicsModel, **fitted)
-    if isinstance(model, Predictor) and model.follows_states and not state_size:
-        raise RecipeError(f"model={choice.name} learns from states: name them in data.states")
     objective.check_model(model)
     return model
 
