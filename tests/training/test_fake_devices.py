@@ -68,6 +68,7 @@ def _train(pipe, data, folder, strategy, world, compiled, rank):
         **{"LOCAL_WORLD_SIZE": f"{NODE}", "GROUP_RANK": f"{node}", "TORCHELASTIC_RUN_ID": "fake"},
         **{"MASTER_ADDR": "localhost", "MASTER_PORT": "1"},
     }
+    counters.clear()  # of the process that this one is forked from
     distributed.init_process_group("fake", rank=rank, world_size=world, store=FakeStore())
     # A fake group would deliver garbage as objects, and has no gloo beside it.
     distributed.broadcast_object_list = lambda *_, **__: None
