@@ -1,4 +1,4 @@
-"""Layers of the recurrent model: convolutions whose weights Muon can update, and FiLM blocks."""
+"""Layers that models share: convolutions whose weights Muon can update, FiLM blocks, and `Look`."""
 
 from __future__ import annotations
 
@@ -60,6 +60,35 @@ class FilmBlock(nn.Module):
         scale, shift, gate = self.film(vector)[..., None, None].chunk(3, 1)
         branch = self.first(channel_norm(grid) * (1 + scale) + shift)
         return grid + gate * self.second(functional.silu(branch))
+
+
+class Look(nn.Module):
+    """Features of the cells of a latent frame, for what is read from them.
+
+    Args:
+        latent_channels: channels C of the latent.
+        channels: channels of its convolutions.
+    """
+
+    def __init__(self, latent_channels: int, channels: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
+        self.layers = nn.ModuleList(
+            nn.Sequential(
+                nn.GroupNorm(1, channels),
+                nn.Conv2d(channels, channels, 3, padding=1),
+                nn.SiLU(),
+                nn.Conv2d(channels, channels, 3, padding=1),
+            )
+            for _ in range(3)
+        )
+
+    def features(self, frame: Tensor) -> Tensor:
+        """Map a latent frame `[B, C, h, w]` to `[B, channels, h, w]`."""
+        grid = self.stem(frame)
+        for layer in self.layers:
+            grid = grid + layer(grid)
+        return functional.silu(grid)
 
 
 def channel_norm(grid: Tensor) -> Tensor:

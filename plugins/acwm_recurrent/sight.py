@@ -5,10 +5,11 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
+from acwm_recurrent.layers import Look
 from acwm_recurrent.poses import Poses
 
 
-class Sight(nn.Module):
+class Sight(Look):
     """Finds every agent and body by where it looks: a softmax over the cells, one for each thing.
 
     Which body is which, it tells by the look: number k has the same colour in all episodes.
@@ -21,18 +22,8 @@ class Sight(nn.Module):
     """
 
     def __init__(self, latent_channels: int, agents: int, bodies: int, channels: int) -> None:
-        super().__init__()
+        super().__init__(latent_channels, channels)
         self.agents, self.things = agents, agents + bodies
-        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
-        self.layers = nn.ModuleList(
-            nn.Sequential(
-                nn.GroupNorm(1, channels),
-                nn.Conv2d(channels, channels, 3, padding=1),
-                nn.SiLU(),
-                nn.Conv2d(channels, channels, 3, padding=1),
-            )
-            for _ in range(3)
-        )
         self.where = nn.Conv2d(channels, self.things, 1)
         self.what = nn.Conv2d(channels, 4 * self.things, 1)
         self.there = nn.Linear(channels, bodies)
@@ -43,10 +34,7 @@ class Sight(nn.Module):
         Returns:
             The poses, and `[B, N]`, the logits of a body's presence.
         """
-        grid = self.stem(frame)
-        for layer in self.layers:
-            grid = grid + layer(grid)
-        grid = functional.silu(grid)
+        grid = self.features(frame)
         looks = self.where(grid).flatten(2).float().softmax(-1)
         seen = self.what(grid).unflatten(1, (self.things, 4)).flatten(3).float()
         found = (seen * looks[:, :, None]).sum(-1)

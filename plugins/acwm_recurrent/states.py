@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
+from acwm_recurrent.layers import FilmBlock, Look, MatrixConv, channel_norm
 
 POINTS = 48
 """Places in the picture that a state is read from, beside what the cells show."""
@@ -24,7 +24,7 @@ STEP = 0.1
 """Scale of a change of states in a video frame, in standard deviations."""
 
 
-class StateSight(nn.Module):
+class StateSight(Look):
     """Reads the states that a latent frame shows.
 
     By where things are, a softmax over the cells for each of `POINTS` (Finn et al. 2016, arXiv
@@ -37,17 +37,7 @@ class StateSight(nn.Module):
     """
 
     def __init__(self, latent_channels: int, states: int, channels: int) -> None:
-        super().__init__()
-        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
-        self.layers = nn.ModuleList(
-            nn.Sequential(
-                nn.GroupNorm(1, channels),
-                nn.Conv2d(channels, channels, 3, padding=1),
-                nn.SiLU(),
-                nn.Conv2d(channels, channels, 3, padding=1),
-            )
-            for _ in range(3)
-        )
+        super().__init__(latent_channels, channels)
         self.where = nn.Conv2d(channels, POINTS, 1)
         self.what = nn.Conv2d(channels, 32, 1)
         self.read = nn.Sequential(
@@ -60,10 +50,7 @@ class StateSight(nn.Module):
 
     def forward(self, frame: Tensor) -> Tensor:
         """The states `[B, S]` in a latent frame `[B, C, h, w]`."""
-        grid = self.stem(frame)
-        for layer in self.layers:
-            grid = grid + layer(grid)
-        grid = functional.silu(grid)
+        grid = self.features(frame)
         height, width = grid.shape[2:]
         looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
         rows, columns = (
