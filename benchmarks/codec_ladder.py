@@ -3,9 +3,10 @@
     OMP_NUM_THREADS=1 python benchmarks/codec_ladder.py --figure docs/codec_ladder.svg
 
 A rung is a codec like `compact` (cells of 8×8 pixels) or `fine` (4×4) with another number of latent
-channels. All are trained as `acwm train-codec` does, on the same episodes at 64×64, and reconstruct
-test episodes of the same worlds. It prints the table of docs/findings/codecs.md, and is continued
-by the same command when it was interrupted.
+channels. First it measures how long a step of each takes, which needs an idle machine; these set
+the numbers of steps. Then all are trained as `acwm train-codec` does, on the same episodes at
+64×64, and reconstruct test episodes of the same worlds. It prints the table of
+docs/findings/codecs.md, and is continued by the same command when it was interrupted.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ EPISODES = {"train": 160, "ind_test": 12}
 SEED = 54321
 BATCH, PEAK, DECAY = 16, 8e-4, 0.5
 PACED = 20
-"""Steps by whose time the number of all steps is chosen."""
+"""Steps of each rung whose time is measured."""
 
 
 class Rung(NamedTuple):
@@ -66,19 +67,24 @@ RUNGS = (
 )
 
 
-def climb(rung: Rung, folders: dict[str, Path], seconds: float) -> dict[str, float]:
-    """Train a codec for so many CPU-seconds: its steps, and its PSNR in dB of each world."""
-    sources = [Source(load_videos(folder, EPISODES["train"])) for folder in folders.values()]
-    codec = rung.make().train()
-    training = Training(codec, sources, batch=BATCH, seed=0)
+def pace(rung: Rung, sources: list[Source]) -> float:
+    """CPU-seconds of a step."""
+    training = Training(rung.make().train(), sources, batch=BATCH, seed=0)
     began = time.process_time()
     for _ in training.steps(PACED, PEAK, 0.0):
         pass
-    pace = (time.process_time() - began) / PACED
-    for _ in training.steps(int(seconds / pace), PEAK, DECAY):
+    return (time.process_time() - began) / PACED
+
+
+def climb(
+    rung: Rung, sources: list[Source], folders: dict[str, Path], steps: int
+) -> dict[str, float]:
+    """Train a codec: its PSNR in dB of each world."""
+    codec = rung.make().train()
+    for _ in Training(codec, sources, batch=BATCH, seed=0).steps(steps, PEAK, DECAY):
         pass
     decibels = {world: reconstruction(codec.eval(), folder) for world, folder in folders.items()}
-    return {"steps": training.step, **{w: v for w, v in decibels.items() if v is not None}}
+    return {world: value for world, value in decibels.items() if value is not None}
 
 
 @click.command()
@@ -91,12 +97,17 @@ def main(data: Path, out: Path, seconds: float, figure: Path | None) -> None:
     folders = {world: data / world for world in WORLDS}
     for world, folder in folders.items():
         generate(world, folder, episodes=EPISODES, seed=SEED, size=64)
-    found = json.loads(out.read_text()) if out.exists() else {}
+    sources = [Source(load_videos(folder, EPISODES["train"])) for folder in folders.values()]
+    if out.exists():
+        found = json.loads(out.read_text())
+    else:
+        found = {rung.name: {"steps": int(seconds / pace(rung, sources))} for rung in RUNGS}
+    out.parent.mkdir(parents=True, exist_ok=True)
     for rung in RUNGS:
-        if rung.name not in found:
-            found[rung.name] = climb(rung, folders, seconds)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            out.write_text(json.dumps(found, indent=1))
+        out.write_text(json.dumps(found, indent=1))
+        if WORLDS[0] not in found[rung.name]:
+            found[rung.name] |= climb(rung, sources, folders, found[rung.name]["steps"])
+    out.write_text(json.dumps(found, indent=1))
     click.echo(f"| Cell, channels | Numbers per frame | Steps | {' | '.join(WORLDS)} |")
     click.echo("| --- | --- | --- |" + " --- |" * len(WORLDS))
     for rung in RUNGS:

@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     default=0.0,
     help="Share of the training episodes, 0 to 1, that reuse the actions of the episode before.",
 )
+@click.option(
+    "--shift",
+    type=float,
+    default=0.0,
+    help="Shift one dimension of those actions by up to this share, 0 to 1, of half its range.",
+)
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 @click.option(
     "--executor",

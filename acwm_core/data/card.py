@@ -55,6 +55,7 @@ class DatasetCard:
         padding: how a clip longer than its episode is filled, see `PADDING`.
         format: version of the folder's layout.
         exploration: share of the training episodes that reuse the previous episode's actions.
+        shift: by up to which share of half its range one dimension of those actions is shifted.
         source: for recorded data, what was imported: `kind`, e.g. ``"lerobot"``, `name`,
             checksums, the `command` if one did it, and `notes` for people. Empty if simulated.
     """
@@ -73,6 +74,7 @@ class DatasetCard:
     padding: str = PADDING
     format: int = FORMAT
     exploration: float = 0.0
+    shift: float = 0.0
     source: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def command(self, out: Path | str, split: str = "all") -> str:
@@ -83,6 +85,7 @@ class DatasetCard:
             return "the program that wrote it"
         factors = "".join(f" factors.{name}={value}" for name, value in self.factors.items())
         exploration = f" --exploration {self.exploration}" if self.exploration else ""
+        exploration += f" --shift {self.shift}" if self.shift else ""
         counts = ",".join(str(self.splits.get(each, 0)) for each in SPLITS)
         which = f"--episodes {counts}" if split == "all" else f"--split {split}"
         height, width = self.environment.frame_size
@@ -203,5 +206,7 @@ def _recipe(card: DatasetCard) -> dict[str, Any]:
     values = card.to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
+    if not values["shift"]:  # data from before there were shifts is the same data
+        del values["shift"]
     values["environment"].pop("symmetries", None)  # they say what could be made of the bytes
     return dict(flat_items(values))

@@ -43,6 +43,7 @@ def generate(
     size: int | tuple[int, int] | None = None,
     factors: Mapping[str, FactorSetting] | None = None,
     exploration: float = 0.0,
+    shift: float = 0.0,
     workers: int | None = None,
     executor: Executor | None = None,
     shard_episodes: int = SHARD_EPISODES,
@@ -64,6 +65,8 @@ def generate(
         exploration: share of the training episodes, from 0 to 1, that reuse the actions of the
             previous episode, chosen for another start. They show what actions do that do not fit
             the scene, which a behaviour policy never shows.
+        shift: in these episodes one dimension of the actions, drawn for each, is shifted in all
+            frames by up to this share of half its range, from 0 to 1.
         workers: number of processes, one per core by default; 0 simulates in this process.
         executor: runs the shards elsewhere, e.g. a `RayExecutor`; replaces `workers`.
 
@@ -79,6 +82,12 @@ def generate(
         raise RecipeError(f"shard_episodes={shard_episodes} must be at least 1")
     if not 0 <= exploration <= 1:
         raise RecipeError(f"exploration={exploration} is a share of episodes, from 0 to 1")
+    if not 0 <= shift <= 1:
+        raise RecipeError(f"shift={shift} is a share of half an action's range, from 0 to 1")
+    if shift and not exploration:
+        raise RecipeError(
+            "shift changes exploratory episodes: set exploration too, for example 0.4"
+        )
     out, executor = Path(out), executor or LocalExecutor(workers)
     component = catalog().component("environment", environment)
     options = {} if size is None else {"size": size}
@@ -99,12 +108,13 @@ def generate(
         options={"size": list(card.frame_size)},
         factors=dict(factors or {}),
         exploration=exploration,
+        shift=shift,
         shard_episodes=shard_episodes,
         versions=package_versions(component.requires),
     )
     # An impossible factor is refused before any worker starts.
     draw_factors(EpisodeSpec(card.name, factors=wanted.factors), card.factors, card.ood_shifts)
-    source = functools.partial(simulated, component, exploration=exploration)
+    source = functools.partial(simulated, component, exploration=exploration, shift=shift)
     return fill(out, wanted, source, executor, progress=progress)
 
 

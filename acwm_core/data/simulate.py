@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.card import check_episode
+from acwm_core.env.card import ActionSpec, check_episode
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.env.symmetry import Symmetry
@@ -127,25 +127,44 @@ def _stacked(what: str, values: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def simulated(
-    component: Component, specs: Sequence[EpisodeSpec], exploration: float = 0.0
+    component: Component,
+    specs: Sequence[EpisodeSpec],
+    exploration: float = 0.0,
+    shift: float = 0.0,
 ) -> Iterator[Episode]:
     """Simulate the episodes `specs` of the environment `component`.
 
-    A share `exploration` of the training episodes reuses the actions of the previous episode, which
-    were chosen for another start; the first of `specs` never does.
+    A share `exploration` of the training episodes reuses the actions of the last episode before it
+    that does not, which were chosen for another start; the first of `specs` never does. One
+    dimension of them is shifted, by up to the share `shift` of half its range.
 
     Raises:
         DataError: an episode does not match the environment's card.
     """
     environment = _environment(component, specs[0].options)
-    actions: NDArray[np.floating[Any]] | None = None
+    chosen: NDArray[np.floating[Any]] | None = None
     for spec in specs:
         explores = spec.split == "train" and spec.rng("exploration").random() < exploration
-        episode = simulate(environment, spec, actions if explores else None)
+        reused = None if chosen is None or not explores else chosen
+        if reused is not None and shift:
+            reused = _shifted(reused, environment.card.action, shift, spec.rng("shift"))
+        episode = simulate(environment, spec, reused)
         with noting(f"in episode {spec.index} of {spec.split} of {environment.card.name}"):
             check_episode(episode, environment.card)
         yield episode
-        actions = episode.actions
+        chosen = episode.actions if reused is None else chosen
+
+
+def _shifted(
+    actions: NDArray[np.floating[Any]], spec: ActionSpec, shift: float, rng: np.random.Generator
+) -> NDArray[np.floating[Any]]:
+    """The actions with one dimension, drawn, moved by as much in all frames, within its bounds."""
+    dimension = rng.integers(spec.size)
+    low, high = spec.low[dimension], spec.high[dimension]
+    shifted = actions.copy()
+    shifted[:, dimension] += rng.uniform(-shift, shift) * (high - low) / 2
+    shifted[:, dimension] = shifted[:, dimension].clip(low, high)
+    return shifted
 
 
 def _environment(component: Component, options: Mapping[str, Any]) -> Environment:

@@ -30,6 +30,7 @@ class DataChoice:
     size: tuple[int, int] | None = None
     seed: int = 0  # seed of the dataset
     exploration: float = 0.0  # share of exploration in the training episodes, see `acwm generate`
+    shift: float = 0.0  # of one dimension of their actions
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ def _simulation(dataset: DatasetSpec, workers: int | None) -> Step:
         "--size": "x".join(map(str, choice.size or ())),
         "--seed": str(choice.seed or ""),
         "--exploration": str(choice.exploration or ""),
+        "--shift": str(choice.shift or ""),
         "--workers": "" if workers is None else str(workers),
     }
     given = [word for option, value in options.items() if value for word in (option, value)]
@@ -151,8 +152,8 @@ def dataset_is_whole(dataset: DatasetSpec) -> bool:
     usual = tuple(environment.episodes.get(split, 0) for split in SPLITS)
     pairs = zip(SPLITS, choice.episodes or usual, strict=True)
     whole = all(card.splits.get(s) == n and s in card.checksums for s, n in pairs if n)
-    origin = (card.seed, card.exploration, dict(card.factors))
-    return whole and origin == (choice.seed, choice.exploration, {})
+    origin = (card.seed, card.exploration, card.shift, dict(card.factors))
+    return whole and origin == (choice.seed, choice.exploration, choice.shift, {})
 
 
 def training_progress(run: RunSpec) -> float:

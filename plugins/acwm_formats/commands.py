@@ -92,7 +92,9 @@ def _print_facts(facts: dict[str, Any]) -> None:
     else:
         click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
         if facts["exploration"]:
-            click.echo(f"{facts['exploration']:.0%} of the training episodes are exploratory")
+            how = f"exploratory, shifted by up to {facts['shift']:g}"
+            how = how if facts["shift"] else "exploratory"
+            click.echo(f"{facts['exploration']:.0%} of the training episodes are {how}")
     columns = ("episodes", "made", "shards", "frames")
     table = plain_table(None, "split", (*columns, "MB"))
     for split, each in facts["splits"].items():

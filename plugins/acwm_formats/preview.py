@@ -50,7 +50,8 @@ def describe(path: str | Path) -> dict[str, Any]:
         "path": str(path),
         "environment": environment["name"],
         **{name: environment[name] for name in ("summary", "frame_size", "fps", "horizon")},
-        **{name: values[name] for name in ("seed", "factors", "exploration", "versions", "source")},
+        **{name: values[name] for name in ("seed", "factors", "exploration", "shift")},
+        **{name: values[name] for name in ("versions", "source")},
         "splits": {split: _describe_split(path, card, split) for split in card.splits},
     }
 

@@ -26,7 +26,7 @@ HORIZONS = ((0.35, 8), (0.65, 20))
 same error in a tenth of the time. Then from whole clips, in which errors add up."""
 
 SHOWN_NOISE = 0.02
-"""Noise on the true states that drawing is learned from: its own will be that far off."""
+"""Noise on the true states that drawing is learned from, beside the error of reading."""
 
 
 class Scene(NamedTuple):
@@ -160,6 +160,7 @@ class DrawnStates(SceneModel[Scene, Tensor]):
         """The true states from the last given frame on, a little off while it learns."""
         course = states[:, (given.shape[1] - 1) * self.stride :]
         if self.training:
+            course = self._as_read(given[:, -1], course)
             noise = SHOWN_NOISE * torch.randn_like(course[:, :2])
             first, later = course[:, :1] + noise[:, :1], course[:, 1:] + noise[:, 1:]
             course = torch.cat([first, later], 1)
@@ -188,6 +189,13 @@ class DrawnStates(SceneModel[Scene, Tensor]):
         with torch.autocast(base.device.type, enabled=False):
             hidden = self.motion.begin(states)
         return Scene(base, self.drawing.canvas(base, states), states, states, hidden)
+
+    @torch.no_grad()
+    def _as_read(self, base: Tensor, course: Tensor) -> Tensor:
+        """True states `[B, T, S]`, all along as wrong as they are read from the first frame."""
+        wrong = (self.sight(base) - course[:, 0])[:, None]
+        with torch.autocast(base.device.type, enabled=False):
+            return self.motion.displaced(course, wrong)
 
     def _motion_loss(
         self, true: Tensor, conditioning: Conditioning, noise: Tensor, *, first: int, frames: int

@@ -113,6 +113,14 @@ class StateMotion(nn.Module):
         moved = states[..., : self.moved] + change
         return (torch.cat([moved, self.follow(moved)], -1) if self.follow else moved), hidden
 
+    def displaced(self, states: Tensor, change: Tensor) -> Tensor:
+        """States `[…, S]` with a change of those that are moved; the others follow."""
+        moved, following = states.split([self.moved, states.shape[-1] - self.moved], -1)
+        other = moved + change[..., : self.moved]
+        if self.follow is None:
+            return other
+        return torch.cat([other, following + self.follow(other) - self.follow(moved)], -1)
+
 
 class StateDrawing(nn.Module):
     """Draws frames: the given one, with what moves as the states say.

@@ -49,7 +49,7 @@ class Step(NamedTuple):
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 
-    Takes about six minutes on two CPU cores: shows the trained model that ships beside the
+    Takes about eight minutes on two CPU cores: shows the trained model that ships beside the
     simulator, then simulates a small dataset, trains a world model, evaluates it and adds it to
     the report in runs/demo (with --quick, runs/demo_quick). If it is interrupted, run the same
     command again to continue.
@@ -79,12 +79,12 @@ def demo(out: Path | None, quick: bool) -> None:
     steps = recipe.trainer["max_steps"]
     _work_through(
         Step(f"simulating {held_out} test episodes", 12, lambda: _generate(recipe, data, tests)),
-        Step("predicting them by the model that ships", 40, lambda: _shipped(recipe, shipped)),
-        Step("writing the first report", 8, first_page),
+        Step("predicting them by the model that ships", 65, lambda: _shipped(recipe, shipped)),
+        Step("writing the first report", 2, first_page),
         Step(f"simulating {episodes} episodes", 90, lambda: _generate(recipe, data, training)),
-        Step(f"training for {steps} steps", 180, lambda: _fit(recipe, run)),
+        Step(f"training for {steps} steps", 290, lambda: _fit(recipe, run)),
         Step("predicting the test episodes", 40, lambda: _evaluate(run)),
-        Step("writing the report", 10, both),
+        Step("writing the report", 4, both),
     )
     from acwm_core.evaluation.results import Summary
 

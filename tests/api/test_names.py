@@ -21,7 +21,7 @@ SIGNATURES = {
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",
     "fit": "(recipe, run_dir, *, resume=None)",
     "generate": "(environment, out, *, episodes, seed=0, size=None, factors=None, exploration=0.0, "
-    "workers=None, executor=None, shard_episodes=32, progress=True)",
+    "shift=0.0, workers=None, executor=None, shard_episodes=32, progress=True)",
     "load": "(path)",
     "make_env": "(name, *, task=None, **params)",
     "make_planner": "(name, **params)",

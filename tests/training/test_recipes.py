@@ -43,12 +43,18 @@ def recordings(action, episodes):
 
 @pytest.fixture(scope="module")
 def data_of(tmp_path_factory):
-    """A function from the name of an environment to data with its name and its actions."""
+    """A function from the name of an environment to data with its name and its actions.
+
+    Recordings have no states; where a recipe learns from them, the environment is simulated.
+    """
     folder = tmp_path_factory.mktemp("recipes")
 
-    def made(environment):
-        out = folder / environment
-        if not out.exists():
+    def made(environment, states=False):
+        out = folder / f"{environment}{'_with_states' * states}"
+        if not out.exists() and states:
+            episodes = {"train": 3}
+            generate(environment, out, episodes=episodes, size=64, workers=0, progress=False)
+        elif not out.exists():
             card = catalog().component("environment", environment).load().card
             episodes = {"train": list(recordings(card.action, 5))}
             given = {"name": environment, "action": card.action, "fps": card.fps}
@@ -72,31 +78,23 @@ def data_of(tmp_path_factory):
         ("push_cube_small", ("codec=identity",)),
         ("push_cube_small", ("objective=diffusion_forcing",)),
         ("push_cube", ("+small", "+recurrent")),
+        ("push_cube", ("+small", "+recurrent", "+planar_bodies")),
+        ("robot_arm", ("+small", "+recurrent", "+drawn_states")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )
 def test_two_real_steps(recipe, words, data_of, tmp_path):
-    environment = compose(recipe, words).env
-    data = data_of(environment.name if environment else "push_cube")
-    takes_two_steps(recipe, words, data, tmp_path)
+    chosen = compose(recipe, words)
+    world = chosen.env.name if chosen.env else "push_cube"
+    states = bool(chosen.data.get("states"))
+    agent = ("training.agent_steps=2",) * states
+    takes_two_steps(recipe, (*words, *agent), data_of(world, states), tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("world", "model"), [("push_cube", "planar_bodies"), ("robot_arm", "drawn_states")]
-)
-def test_two_real_steps_on_states(world, model, tmp_path):
-    """The recordings have no states, so these are simulated."""
-    data = tmp_path / "data"
-    generate(world, data, episodes={"train": 3}, size=(64, 64), workers=0, progress=False)
-    words = ("+small", "+recurrent", f"+{model}", "training.agent_steps=2")
-    takes_two_steps(world, words, data, tmp_path)
-    with pytest.raises(RecipeError, match=f"model={model} learns from states: name them"):
-        takes_two_steps(
-            world,
-            (*words, "data.states=[]", "training.agent_steps=0"),
-            data,
-            tmp_path / "other",
-        )
+def test_a_model_of_states_is_refused_without_them(data_of, tmp_path):
+    words = ("+small", "+recurrent", "+drawn_states", "data.states=[]", "training.agent_steps=0")
+    with pytest.raises(RecipeError, match="model=drawn_states learns from states: name them"):
+        takes_two_steps("robot_arm", words, data_of("robot_arm"), tmp_path)
 
 
 def takes_two_steps(recipe, words, data, tmp_path):
