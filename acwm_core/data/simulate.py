@@ -145,7 +145,7 @@ def simulated(
     chosen: NDArray[np.floating[Any]] | None = None
     for spec in specs:
         explores = spec.split == "train" and spec.rng("exploration").random() < exploration
-        reused = None if chosen is None or not explores else chosen
+        reused = chosen if explores else None
         if reused is not None and shift:
             reused = _shifted(reused, environment.card.action, shift, spec.rng("shift"))
         episode = simulate(environment, spec, reused)

@@ -104,6 +104,22 @@ def test_it_draws_what_it_is_told_and_learns_nothing_of_motion_by_it():
     assert changed.nonzero().flatten().tolist() == [8]  # frame 9 is the 9th after the given one
 
 
+def test_it_learns_to_draw_states_as_wrong_as_it_reads_them():
+    """All along as wrong as in the given frame; the hand is where these angles lead it."""
+    torch.manual_seed(0)
+    model = model_of_arms(following=2)
+    states, _ = arms(8, seed=0)
+    given = torch.randn(8, 1, 3, 8, 8)
+    with torch.no_grad():
+        course = model.train().true_course(given, states)[1]
+        wrong = model.sight(given[:, 0])[:, :2] - states[:, 0, :2]
+        angles, hands = course.split(2, -1)
+        assert (angles - states[..., :2] - wrong[:, None]).abs().mean() < 0.03 < wrong.abs().mean()
+        led, leads = model.motion.follow(angles), model.motion.follow(states[..., :2])
+        assert (hands - states[..., 2:] - (led - leads)).abs().mean() < 0.03
+        torch.testing.assert_close(model.eval().true_course(given, states)[1], states)
+
+
 def test_what_does_not_fit_is_refused():
     with pytest.raises(RecipeError, match="at least 1"):
         model_of_arms(blocks=0)
