@@ -71,7 +71,7 @@ codec-weights: $(VENV)/installed-all  ## Train the codec fine anew, in hours (do
 	  $(CODEC_FOLDER)/*_240 --codec fine --start random --out $(CODEC_FOLDER)/fine.safetensors \
 	  $(CODEC_OPTIONS)
 
-decoders: codec-weights  ## Train compact_reference and the decoder of stack_cube anew
+decoders: codec-weights  ## Train compact_reference anew
 	@set -e; for each in $(DECODER_DATA); do \
 	  set -- $$(echo $$each | tr : ' '); \
 	  size=64; if [ $$1 = push_sand ]; then size=64x112; fi; \
@@ -82,8 +82,6 @@ decoders: codec-weights  ## Train compact_reference and the decoder of stack_cub
 	  --codec compact_reference --start compact --out $(DECODER) $(DECODER_OPTIONS) --steps 8000 \
 	  $$(ls $(CODEC_FOLDER)/new | sed 's/^/--predicted-by /')
 	cp $(DECODER) plugins/acwm_codecs/weights/compact_reference.safetensors
-	$(BIN)/acwm train-codec $(CODEC_FOLDER)/new/stack_cube --codec compact_reference --freeze-coarse \
-	  --out $(CODEC_FOLDER)/stack_cube.safetensors $(DECODER_OPTIONS) --steps 600 --predicted-by stack_cube
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
 	$(BIN)/python -m build
