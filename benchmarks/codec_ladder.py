@@ -138,7 +138,7 @@ def draw(found: dict[str, dict[str, float]], figure: Path) -> None:
         chart.minorticks_off()
         chart.spines[["top", "right"]].set_visible(False)
     charts[0].set_ylabel("PSNR, dB")
-    charts[0].legend(frameon=False)
+    charts[0].legend(frameon=False, loc="upper left", borderpad=0)
     drawing.savefig(figure, metadata={"Date": None})
 
 
