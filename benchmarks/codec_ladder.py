@@ -125,7 +125,7 @@ def main(data: Path, out: Path, seconds: float, figure: Path | None) -> None:
 def draw(found: dict[str, dict[str, float]], figure: Path) -> None:
     """Distortion by rate, a chart for each world and a line for each size of a cell."""
     plt.rcParams |= {"svg.hashsalt": "ladder", "svg.fonttype": "none", "font.family": "sans-serif"}
-    drawing, charts = plt.subplots(1, len(WORLDS), figsize=(8, 3), layout="constrained")
+    drawing, charts = plt.subplots(1, len(WORLDS), figsize=(8, 3.3), layout="constrained")
     for world, chart in zip(WORLDS, charts, strict=True):
         for like, colour in ((Compact, "tab:blue"), (Fine, "tab:orange")):
             rungs = [rung for rung in RUNGS if rung.like is like]
@@ -138,7 +138,8 @@ def draw(found: dict[str, dict[str, float]], figure: Path) -> None:
         chart.minorticks_off()
         chart.spines[["top", "right"]].set_visible(False)
     charts[0].set_ylabel("PSNR, dB")
-    charts[0].legend(frameon=False, loc="upper left", borderpad=0)
+    lines = charts[0].get_legend_handles_labels()
+    drawing.legend(*lines, loc="outside lower center", ncols=2, frameon=False)
     drawing.savefig(figure, metadata={"Date": None})
 
 
