@@ -49,7 +49,7 @@ class Step(NamedTuple):
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report, at once.
 
-    Takes about eight minutes on two CPU cores: shows the trained model that ships beside the
+    Takes about nine minutes on two CPU cores: shows the trained model that ships beside the
     simulator, then simulates a small dataset, trains a world model, evaluates it and adds it to
     the report in runs/demo (with --quick, runs/demo_quick). If it is interrupted, run the same
     command again to continue.
