@@ -110,8 +110,16 @@ def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
 
 @OLD
 @pytest.mark.slow
-def test_the_graphs_of_a_model_that_moves_bodies_are_its_stream():
-    world = recurrent_world(name="planar_bodies", bodies=2)
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"name": "planar_bodies", "bodies": 2},
+        {"name": "drawn_states", "state_size": 4, "following": 2},
+    ],
+    ids=lambda model: model["name"],
+)
+def test_the_graphs_of_a_model_that_moves_a_scene_are_its_stream(model):
+    world = recurrent_world(**model)
     made = export_graphs(world, SIZE)
     check(made, world, torch.rand(1, 3, *SIZE).numpy(), (torch.rand(24, 2) * 2 - 1).numpy())
 

@@ -127,6 +127,7 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
     begin = given, *_draw(world, seed=0)
     with torch.no_grad():
         latent, *state = Start(world)(*begin)
+        state = [each.clone() for each in state]  # a tensor given twice would be one input
         states = [f"state_{k}" for k in range(len(state))]
         moved = [f"next_{each}" for each in states]
         graph, shown = _graph, (latent, *_reference(world, given))
