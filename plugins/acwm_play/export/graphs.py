@@ -271,8 +271,7 @@ def check(
         worst = max(worst, float(np.abs(stream.step(rows) - expected).max()))
     if not worst <= TOLERANCE:
         raise RecipeError(
-            f"the exported model differs from the original by {worst:.2g} of full scale, because "
-            "its conditioner uses the actions of other latent frames: use another conditioner, "
-            "such as adaln"
+            f"the exported model differs from the original by {worst:.2g} of full scale: if its "
+            "conditioner uses the actions of other latent frames, use another, such as adaln"
         )
     return worst
