@@ -24,6 +24,12 @@ def register_models(registry: Registry) -> None:
         summary="3 M parameters: moves the states of a robot and of what it holds, and draws them",
         objective="regression",
     )
+    registry.add(
+        "flexible_body",
+        "acwm_recurrent.flexible:FlexibleBody",
+        summary="1 M parameters: moves the nodes of a rope or a cloth, and draws them",
+        objective="regression",
+    )
 
 
 @hookimpl

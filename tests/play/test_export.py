@@ -115,6 +115,7 @@ def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
     [
         {"name": "planar_bodies", "bodies": 2},
         {"name": "drawn_states", "state_size": 4, "following": 2},
+        {"name": "flexible_body", "nodes": [9]},
     ],
     ids=lambda model: model["name"],
 )

@@ -1,0 +1,176 @@
+"""Draws a latent frame from the given one and from where agents and nodes are."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
+from acwm_recurrent.nodes import Form, NodeLayout, View, along_sides, seen_at
+from acwm_recurrent.poses import waves, waves_size
+
+SIGHTS = (0.5, 0.9, 1.6, 4.0)
+"""How far around it a cell looks, in cells; where it begins to learn."""
+
+VALUES = 32
+"""Values that a node tells the cells, for each of `SIGHTS`."""
+
+OCTAVES = 3
+
+INSIDE = 3
+"""Octaves of the Fourier features of a place in its cell; the longest wave has two cells."""
+
+LOOK = 16
+"""Values that tell how a node or an agent looks."""
+
+
+class NodeMap(nn.Module):
+    """A map of what is where: what the nodes and agents near each cell tell it.
+
+    Each cell looks at the nodes by where they are in the picture, those in front first.
+
+    Args:
+        layout: of the nodes.
+        view: the camera.
+        stride: video frames per latent frame.
+        channels: channels of the map.
+    """
+
+    def __init__(self, layout: NodeLayout, view: View, stride: int, channels: int) -> None:
+        super().__init__()
+        self.layout, self.view = layout, view
+        axes, sides, count = layout.axes, len(layout.shape), math.prod(layout.shape)
+        place, before = waves_size(axes, OCTAVES), (stride - 1) * axes
+        told = len(SIGHTS) * (VALUES + 1)
+        self.node = nn.Sequential(
+            nn.Linear(place + before + 2 * sides * axes + 2 * LOOK, 2 * channels),
+            nn.SiLU(),
+            nn.Linear(2 * channels, told),
+        )
+        self.agent = nn.Sequential(
+            nn.Linear(place + before + LOOK, channels), nn.SiLU(), nn.Linear(channels, told)
+        )
+        self.node_look = nn.Parameter(0.3 * torch.randn(count, LOOK))
+        self.agent_look = nn.Parameter(0.3 * torch.randn(layout.agents, LOOK))
+        self.spread = nn.Parameter(torch.tensor(SIGHTS).log())
+        self.mix = nn.Linear(len(SIGHTS) * (VALUES + 3), channels)
+
+    def forward(self, form: Form, looks: Tensor, size: torch.Size) -> Tensor:
+        """The map `[B, channels, *size]` of forms in some video frames, the last one first.
+
+        `looks`, `[B, N, LOOK]`, is how the given frame shows each node.
+        """
+        now, sides = form.at(0), along_sides(form.nodes[:, 0], self.layout.shape)
+        looks = torch.cat([looks, self.node_look.expand(len(looks), -1, -1)], -1)
+        nodes = self._told(form.nodes, [sides, looks])
+        agents = self._told(form.agents, [self.agent_look.expand(len(sides), -1, -1)])
+        told = torch.cat([self.node(nodes), self.agent(agents)], 1).float()
+        told = told.unflatten(2, (len(SIGHTS), VALUES + 1)).transpose(1, 2)  # [B, heads, N, …]
+        height, width = size
+        seen = self.view(torch.cat([now.nodes, now.agents], 1), width / height)
+        cells = _cells(height, width, seen)
+        scale = seen.new_tensor([width / 2, height / 2])
+        spots = seen[..., :2] * scale
+        apart = (cells[:, None] - spots[:, None]).square().sum(-1)
+        spread = self.spread.exp()[:, None, None]
+        near = -apart[:, None] / (2 * spread.square()) + told[..., None, :, -1]
+        near = torch.cat([near, torch.zeros_like(near[..., :1])], -1).softmax(-1)[..., :-1]
+        much = near.sum(-1, keepdim=True)
+        offset = (near @ spots[:, None] - much * cells) / spread
+        heard = torch.cat([near @ told[..., :-1], offset, much], -1)
+        made = self.mix(heard.transpose(1, 2).flatten(2))
+        return made.transpose(1, 2).unflatten(2, size)
+
+    def _told(self, places: Tensor, further: list[Tensor]) -> Tensor:
+        """What is known of things at `[B, frames, N, D]`, of which the last frame is the first."""
+        now = places[:, 0]
+        before = (now[:, None] - places[:, 1:]).permute(0, 2, 1, 3).flatten(2)
+        return torch.cat([waves(now / 2, OCTAVES), before, *further], -1)
+
+
+class NodeDrawing(nn.Module):
+    """Draws frames: the given one, with what moved where it is now.
+
+    Args:
+        latent_channels: channels C of the latent.
+        layout: of the nodes.
+        view: the camera.
+        stride: video frames per latent frame; a latent frame shows how things move within it.
+        channels: channels of the grid.
+        width: size of the vector that the blocks are modulated by; it is the same for all frames.
+        blocks: number of residual blocks.
+    """
+
+    def __init__(
+        self,
+        latent_channels: int,
+        layout: NodeLayout,
+        view: View,
+        *,
+        stride: int,
+        channels: int,
+        width: int,
+        blocks: int,
+    ) -> None:
+        super().__init__()
+        self.map = NodeMap(layout, view, stride, channels)
+        self.view = view
+        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
+        self.look = nn.Sequential(
+            nn.Linear(channels + waves_size(2, INSIDE) - 2, channels),
+            nn.SiLU(),
+            nn.Linear(channels, LOOK),
+        )
+        self.then, self.now = (nn.Conv2d(channels, channels, 1) for _ in range(2))
+        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
+        self.vector = nn.Parameter(torch.zeros(width))
+        self.head = MatrixConv(channels, channels)
+        self.out = nn.Conv2d(channels, latent_channels, 1)
+        for parameter in self.out.parameters():
+            nn.init.zeros_(parameter)
+
+    def canvas(self, base: Tensor, form: Form) -> tuple[Tensor, Tensor]:
+        """What all frames start from: the given frame and its form, and how it shows each node.
+
+        A node takes its look along wherever it moves, as the stripe of a rope does.
+
+        Args:
+            base: the given latent frame, `[B, C, h, w]`.
+            form: in its last video frames, as in `forward`.
+
+        Returns:
+            `[B, channels, h, w]` and `[B, N, LOOK]`.
+        """
+        grid, (height, width) = self.stem(base), base.shape[-2:]
+        spots = self.view(form.nodes[:, 0], width / height)[..., :2]
+        inside = spots * spots.new_tensor([width / 2, height / 2])  # in cells
+        seen = torch.cat([seen_at(grid.float(), spots), waves(4 * inside, INSIDE)[..., 2:]], -1)
+        looks = self.look(seen)
+        return grid + self.then(self.map(form, looks, base.shape[-2:])), looks
+
+    def forward(self, canvas: Tensor, looks: Tensor, form: Form) -> Tensor:
+        """The change of the given latent frame, `[B, C, h, w]`.
+
+        Args:
+            canvas: see `canvas`.
+            looks: see `canvas`.
+            form: in the video frames of the latent frame, the last one first: `[B, stride, …]`.
+        """
+        grid = canvas + self.now(self.map(form, looks, canvas.shape[-2:]))
+        grid = grid.contiguous(memory_format=torch.channels_last)
+        vector = self.vector.expand(len(grid), -1)
+        for block in self.blocks:
+            grid = block(grid, vector)
+        return self.out(functional.silu(self.head(channel_norm(grid))))
+
+
+def _cells(height: int, width: int, like: Tensor) -> Tensor:
+    """Middles of the cells, `[height width, 2]`: right and down, in cells from the middle."""
+    rows, columns = (
+        torch.arange(size, device=like.device) + 0.5 - size / 2 for size in (height, width)
+    )
+    down, right = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([right, down], -1).flatten(0, 1).to(like)

@@ -1,0 +1,102 @@
+"""Reads where agents and nodes are from a latent frame."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_recurrent.layers import Look
+from acwm_recurrent.nodes import Form, NodeBlock, NodeLayout, View, along_sides, seen_at
+from acwm_recurrent.poses import waves, waves_size
+
+POINTS, CELLS, HIDDEN, OCTAVES = 32, 4, 256, 3
+
+ROUNDS = 3
+"""How often it looks again where it thinks that things are."""
+
+SPREAD = 4.0
+"""Scale of the first guess, in units."""
+
+
+class NodeSight(Look):
+    """Guesses from the whole frame where things are, then looks there and corrects itself.
+
+    So a snake finds a contour (Kass et al. 1988): what the picture shows at each node, and where
+    its neighbours are, tell where it should move.
+
+    Args:
+        latent_channels: channels C of the latent.
+        layout: of the nodes.
+        view: the camera.
+        channels: channels of its convolutions.
+    """
+
+    def __init__(self, latent_channels: int, layout: NodeLayout, view: View, channels: int) -> None:
+        super().__init__(latent_channels, channels)
+        self.layout, self.view = layout, view
+        axes, sides = layout.axes, len(layout.shape)
+        values = (layout.agents + math.prod(layout.shape)) * axes
+        self.where = nn.Conv2d(channels, POINTS, 1)
+        self.what = nn.Conv2d(channels, 32, 1)
+        self.guess = nn.Sequential(
+            nn.Linear(2 * POINTS + 32 * CELLS**2, HIDDEN),
+            nn.SiLU(),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.SiLU(),
+            nn.Linear(HIDDEN, values),
+        )
+        place = waves_size(axes, OCTAVES)
+        self.agent = nn.Sequential(
+            nn.Linear(channels + place, channels), nn.SiLU(), nn.Linear(channels, axes)
+        )
+        self.tell = nn.Linear(channels + place + 2 * sides * axes, channels)
+        self.blocks = nn.ModuleList(NodeBlock(sides, channels, each) for each in (1, 2, 4))
+        self.shift = nn.Linear(channels, axes)
+
+    def forward(self, frame: Tensor) -> list[Form]:
+        """The forms that a latent frame `[B, C, h, w]` shows: the first guess to the last one."""
+        grid = self.features(frame)
+        forms = [self._guessed(grid)]
+        for _ in range(ROUNDS):
+            forms.append(self._corrected(grid.float(), forms[-1]))
+        return forms
+
+    def _guessed(self, grid: Tensor) -> Form:
+        height, width = grid.shape[2:]
+        looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
+        rows, columns = (
+            torch.linspace(-1, 1, size, device=grid.device) for size in (height, width)
+        )
+        places = torch.cat([looks.sum(3) @ rows[:, None], looks.sum(2) @ columns[:, None]], 2)
+        cells = functional.adaptive_avg_pool2d(self.what(grid), CELLS)
+        made = SPREAD * self.guess(torch.cat([places.flatten(1), cells.flatten(1)], 1)).float()
+        made = made.unflatten(1, (-1, self.layout.axes))
+        agents = self.layout.agents
+        return Form(made[:, :agents], made[:, agents:])
+
+    def _corrected(self, grid: Tensor, form: Form) -> Form:
+        agents, nodes = (each.detach() for each in form)  # where it looks is not learned by looking
+        seen, shown = self._seen(grid, agents), self._seen(grid, nodes)
+        shift = self.agent(torch.cat([seen, waves(agents / 2, OCTAVES)], -1))
+        sides = along_sides(nodes, self.layout.shape)
+        features = self.tell(torch.cat([shown, waves(nodes / 2, OCTAVES), sides], -1))
+        for block in self.blocks:
+            features = block(features, self.layout.shape)
+        moved = self.shift(functional.silu(features))
+        return Form(form.agents + shift.float(), form.nodes + moved.float())
+
+    def _seen(self, grid: Tensor, places: Tensor) -> Tensor:
+        """What the frame shows at places `[B, N, D]`: `[B, N, channels]`."""
+        return seen_at(grid, self.view(places, grid.shape[3] / grid.shape[2])[..., :2])
+
+
+def form_loss(made: Form, true: Form) -> Tensor:
+    """How far off agents and nodes are, `[B]`: by the distance, and not its square."""
+    agents, nodes = (
+        functional.smooth_l1_loss(mine, real, beta=0.05, reduction="none").flatten(1).mean(1)
+        for mine, real in zip(made, true, strict=True)
+    )
+    return nodes + 0.5 * agents

@@ -1,0 +1,201 @@
+"""A rope of nodes: they are read, moved and drawn, each learnt from the truth of the others."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.model.conditioner import Conditioning
+from acwm_recurrent import node_windows as node_windows_module
+from acwm_recurrent.flexible import FlexibleBody
+from acwm_recurrent.node_sight import NodeSight, form_loss
+from acwm_recurrent.node_windows import node_windows
+from acwm_recurrent.nodes import Form, NodeLayout, View
+from acwm_sim.camera import Camera
+from tests.recurrent.dots import world_of
+
+NODES, FRAMES, REACH = 9, 17, 1.0
+EYE, TARGET, FOV = (0.0, -6.0, 9.0), (0.0, 0.5, 0.0), 40.0
+
+
+def ropes(clips, seed):
+    """An agent that goes where it is told, and a line of nodes that it pushes; as states.
+
+    It leaves each node at the distance `REACH` behind which it was met, so that all that happens
+    follows from simple geometry.
+    """
+    random = np.random.default_rng(seed)
+    actions = random.uniform(-1, 1, (clips, FRAMES, 2)).astype(np.float32).repeat(4, 1)[:, :FRAMES]
+    agent, nodes = np.zeros((clips, FRAMES, 2)), np.zeros((clips, FRAMES, NODES, 2))
+    agent[:, 0] = random.uniform(-3, 3, (clips, 2))
+    angle = random.uniform(0, 2 * math.pi, (clips, 1))
+    along = np.linspace(-1.5, 1.5, NODES)
+    nodes[:, 0] = np.stack([np.cos(angle) * along, np.sin(angle) * along], -1)
+    for now in range(1, FRAMES):
+        goal = 3 * actions[:, now - 1]
+        agent[:, now] = agent[:, now - 1] + 0.3 * (goal - agent[:, now - 1])
+        apart = nodes[:, now - 1] - agent[:, now, None]
+        far = np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-6)
+        pushed = agent[:, now, None] + apart / far * REACH
+        nodes[:, now] = np.where(far < REACH, pushed, nodes[:, now - 1])
+    states = np.concatenate([agent, nodes.reshape(clips, FRAMES, -1)], -1)
+    return torch.tensor(states, dtype=torch.float32), torch.tensor(actions)
+
+
+def model_of_ropes(**parameters):
+    asked = {"latent_channels": 2, "state_size": 2 + 2 * NODES, "temporal_stride": 1}
+    asked |= {"nodes": [NODES], "every": 1, "unit": 1.0, "eye": EYE, "target": TARGET, "fov": FOV}
+    small = {"channels": 16, "motion_channels": 32, "width": 32, "blocks": 1}
+    return FlexibleBody(**asked | small | parameters)
+
+
+def test_states_are_nodes_in_units():
+    """Two agents and a cloth of three by two nodes, of which every second one is kept."""
+    layout = NodeLayout(2, [3, 2], 2, 0.1, 24)
+    form = layout.form(torch.arange(24.0)[None, None])
+    assert (layout.shape, layout.axes) == ((2, 1), 3)
+    torch.testing.assert_close(form.agents[0, 0, 1], torch.tensor([30.0, 40.0, 50.0]))
+    torch.testing.assert_close(form.nodes[0, 0, 1], torch.tensor([180.0, 190.0, 200.0]))
+    with pytest.raises(RecipeError, match=r"23 values, which are not x and y, or x, y and z"):
+        NodeLayout(2, [3, 2], 2, 0.1, 23)
+    with pytest.raises(ShapeError, match="9 values, not 24"):
+        layout.form(torch.zeros(1, 1, 9))
+    with pytest.raises(RecipeError, match=r"as in \[80\] or \[21,21\]"):
+        NodeLayout(1, [3, 2, 2], 1, 0.1, 24)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1.75])
+def test_the_view_is_that_of_the_renderer(aspect):
+    points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    pixels = Camera(EYE, TARGET, fov=FOV).project(points, 64, round(64 * aspect))
+    seen = View(EYE, TARGET, FOV, 0.1)(torch.tensor(points / 0.1, dtype=torch.float32), aspect)
+    expected = pixels / [32 * aspect, 32, 0.1] - [1, 1, 0]
+    torch.testing.assert_close(
+        seen, torch.tensor(expected, dtype=torch.float32), rtol=1e-3, atol=1e-3
+    )
+    with pytest.raises(RecipeError, match="two different places"):
+        View(EYE, EYE, FOV, 0.1)
+
+
+def test_windows_are_seen_from_other_sides_and_ends():
+    """What is turned, mirrored or counted from the other end keeps its distances."""
+    layout = NodeLayout(1, [NODES], 1, 1.0, 2 + 2 * NODES)
+    true = layout.form(ropes(64, seed=0)[0])
+    window = node_windows(true, torch.Generator().manual_seed(0), 0.5, ends=True)
+    assert window.nodes.shape[1:] == (10, NODES, 2)
+    ends = (window.nodes - window.agents).norm(dim=-1)[:, 1, [0, -1]].double()
+    known = (true.nodes - true.agents).norm(dim=-1)[..., [0, -1]].flatten(0, 1).double()
+    straight, round_about = (
+        torch.cdist(ends, each).amin(1) < 1e-4 for each in (known, known.flip(1))
+    )
+    assert (straight | round_about).all()
+    assert not straight.all()
+    assert not round_about.all()
+    moved = (window.nodes[:, -1] - window.nodes[:, 1]).abs().amax((1, 2)) > 0.05
+    assert moved.float().mean() > 0.8
+
+
+def test_it_learns_how_agents_push_nodes(monkeypatch):
+    """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
+    monkeypatch.setattr(node_windows_module, "NODES", 4000)
+    model = model_of_ropes()
+    world = world_of(model, stride=1, states=2 + 2 * NODES)
+    optimizer = torch.optim.AdamW(world.parameters(), 3e-3)
+    random = torch.Generator().manual_seed(0)
+    states, actions = ropes(256, seed=0)
+    for step in range(200):
+        rows = torch.randint(256, (64,), generator=random)
+        optimizer.zero_grad()
+        loss = world.motion_loss(actions[rows], states[rows], random, progress=step / 600)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(world.parameters(), 0.5)
+        optimizer.step()
+    states, actions = ropes(64, seed=1)
+    true = model.layout.form(states)
+    with torch.no_grad():
+        scene = model._begun(torch.zeros(64, 2, 8, 8), true.at(0))
+        rows = world.conditioner.condition(world.normalise(actions), FRAMES, model.width)
+        told = model.told_of(rows)
+        for frame in range(1, FRAMES):
+            scene, _ = model.step(scene, told[:, frame : frame + 1])
+    off = (scene.form.nodes - true.nodes[:, -1]).norm(dim=-1).mean()
+    assert off < 0.5 * (true.nodes[:, 0] - true.nodes[:, -1]).norm(dim=-1).mean()
+
+
+def test_it_finds_a_line_in_a_picture_from_either_end():
+    torch.manual_seed(0)
+    layout = NodeLayout(1, [NODES], 1, 1.0, 2 + 2 * NODES)
+    view = View(EYE, TARGET, FOV, 1.0)
+    sight = NodeSight(2, layout, view, 24)
+    optimizer = torch.optim.AdamW(sight.parameters(), 3e-3)
+    sides = (torch.arange(12) + 0.5) / 6 - 1
+    cells = torch.stack(torch.meshgrid(sides, sides, indexing="xy"), -1).flatten(0, 1)
+
+    def pictures(clips, seed):
+        true = layout.form(ropes(clips, seed)[0][:, :1]).at(0)
+        drawn = [
+            torch.exp(-20 * (view(each, 1.0)[..., None, :2] - cells).square().sum(-1)).sum(1)
+            for each in true
+        ]
+        return torch.stack(drawn, 1).unflatten(2, (12, 12)), true
+
+    def missed(forms, true):
+        other = true.reversed(torch.ones(len(true.nodes), dtype=torch.bool))
+        return [torch.minimum(form_loss(each, true), form_loss(each, other)) for each in forms]
+
+    for step in range(120):
+        frames, true = pictures(64, step)
+        optimizer.zero_grad()
+        torch.stack(missed(sight(frames), true)).mean().backward()
+        optimizer.step()
+    frames, true = pictures(64, 1000)
+    with torch.no_grad():
+        first, *_, last = missed(sight(frames), true)
+    assert last.mean() < 0.25
+    assert last.mean() < first.mean()
+
+
+def test_it_draws_what_it_is_told_and_learns_nothing_of_motion_by_it():
+    torch.manual_seed(0)
+    model = model_of_ropes().eval()
+    torch.nn.init.normal_(model.drawing.out.weight)
+    states, _ = ropes(2, seed=0)
+    given, modulation = torch.randn(2, 1, 2, 8, 8), torch.randn(2, FRAMES, 32)
+    conditioning = Conditioning(modulation, None, None)
+    drawn = model(given, conditioning, FRAMES, states=states)
+    drawn.square().mean().backward()
+    idle = (model.sight, model.agent_motion, model.node_motion)
+    assert all(each.grad is None for part in idle for each in part.parameters())
+    other = states.clone()
+    other[:, 9] += 1
+    changed = (model(given, conditioning, FRAMES, states=other) - drawn).abs().amax((0, 2, 3, 4))
+    assert changed.nonzero().flatten().tolist() == [8]  # frame 9 is the 9th after the given one
+
+
+def test_it_learns_to_draw_nodes_as_wrong_as_it_reads_them_and_in_its_order():
+    torch.manual_seed(0)
+    model = model_of_ropes()
+    given, states = torch.randn(8, 1, 2, 8, 8), ropes(8, seed=0)[0]
+    true = model.layout.form(states)
+    backwards = Form(true.agents, true.nodes.flip(-2))
+    with torch.no_grad():
+        course = model.train().true_course(given, states)[1]
+        read = model.sight(given[:, 0])[-1]
+    for clip in range(8):
+        off = [
+            (course.nodes[clip] - each.nodes[clip] - (read.nodes[clip] - each.nodes[clip, 0]))
+            for each in (true, backwards)
+        ]
+        assert min(each.abs().max() for each in off) < 0.3
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(RecipeError, match="at least 1"):
+        model_of_ropes(blocks=0)
+    model = model_of_ropes()
+    with pytest.raises(ShapeError, match="FlexibleBody takes latents"):
+        model.start(torch.zeros(1, 1, 3, 8, 8))
+    with pytest.raises(RecipeError, match=r"flexible_body takes actions .* conditioner=adaln"):
+        model(torch.zeros(1, 1, 2, 8, 8), Conditioning(None, None, None), FRAMES)
