@@ -57,6 +57,8 @@ CODEC_OPTIONS ?= --steps 16000 --batch 16 --peak 8e-4
 # Episodes that no model that ships has seen: it predicts its own better.
 DECODER_DATA := cloth_move:256 push_sand:88 pour_water:96 stack_cube:256 push_rope:256 push_cube:256 \
   robot_arm:256 reacher:256
+# The models that ship and predict its latents; of other worlds it learns from true ones.
+DECODER_MODELS := cloth_move push_sand pour_water push_cube reacher
 DECODER := $(CODEC_FOLDER)/compact_reference.safetensors
 DECODER_OPTIONS ?= --batch 24 --peak 5e-4
 
@@ -80,7 +82,7 @@ decoders: codec-weights  ## Train compact_reference anew
 	done
 	$(BIN)/acwm train-codec $(CODEC_FOLDER)/new/* $(CODEC_FOLDER)/new/* $(CODEC_FOLDER)/*_240 \
 	  --codec compact_reference --start compact --out $(DECODER) $(DECODER_OPTIONS) --steps 8000 \
-	  $$(ls $(CODEC_FOLDER)/new | sed 's/^/--predicted-by /')
+	  $(addprefix --predicted-by ,$(DECODER_MODELS))
 	cp $(DECODER) plugins/acwm_codecs/weights/compact_reference.safetensors
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
