@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
+from acwm_recurrent.layers import FrameDrawing
 from acwm_recurrent.poses import Poses, waves, waves_size
 
 OCTAVES = 5
@@ -46,7 +46,7 @@ class ThingMap(nn.Module):
         return (looks * there[:, :, None]).sum(1).transpose(1, 2)
 
 
-class Drawing(nn.Module):
+class Drawing(FrameDrawing):
     """Draws frames: the given one, with each thing moved from where it was to where it is.
 
     Args:
@@ -70,18 +70,13 @@ class Drawing(nn.Module):
         width: int,
         blocks: int,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            latent_channels, 2 * channels, channels=channels, width=width, blocks=blocks
+        )
         before = stride - 1
         self.agents = ThingMap(agents, 2 * before, channels)
         self.bodies = ThingMap(bodies, 2 + 4 * before, channels)
-        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
-        self.then, self.now = (nn.Conv2d(2 * channels, channels, 1) for _ in range(2))
-        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
         self.vector = nn.Parameter(torch.zeros(width))
-        self.head = MatrixConv(channels, channels)
-        self.out = nn.Conv2d(channels, latent_channels, 1)
-        for parameter in self.out.parameters():
-            nn.init.zeros_(parameter)
 
     def canvas(self, base: Tensor, poses: Poses, cells: Tensor) -> Tensor:
         """What all frames start from, `[B, channels, h, w]`: the given frame, and what is where.
@@ -101,12 +96,9 @@ class Drawing(nn.Module):
             poses: in the video frames of the latent frame, the last one first: `[B, stride, …]`.
             cells: places of the cells, `[h w, 2]`.
         """
-        grid = canvas + self.now(self._map(poses, cells, canvas.shape[-2:]))
-        grid = grid.contiguous(memory_format=torch.channels_last)
-        vector = self.vector.expand(len(grid), -1)
-        for block in self.blocks:
-            grid = block(grid, vector)
-        return self.out(functional.silu(self.head(channel_norm(grid))))
+        return self.change(
+            canvas, self._map(poses, cells, canvas.shape[-2:]), self.vector.expand(len(canvas), -1)
+        )
 
     def _map(self, poses: Poses, cells: Tensor, size: torch.Size) -> Tensor:
         agents, places, turns = (

@@ -1,4 +1,4 @@
-"""Layers that models share: convolutions whose weights Muon can update, FiLM blocks, and `Look`."""
+"""Layers that models share: convolutions whose weights Muon can update, and what they make up."""
 
 from __future__ import annotations
 
@@ -60,6 +60,43 @@ class FilmBlock(nn.Module):
         scale, shift, gate = self.film(vector)[..., None, None].chunk(3, 1)
         branch = self.first(channel_norm(grid) * (1 + scale) + shift)
         return grid + gate * self.second(functional.silu(branch))
+
+
+class FrameDrawing(nn.Module):
+    """Draws latent frames on a canvas: the given frame and a map of what is where in it.
+
+    Args:
+        latent_channels: channels C of the latent.
+        mapped: channels of the maps.
+        channels: channels of the grid.
+        width: size of the vector that the blocks are modulated by.
+        blocks: number of residual blocks.
+    """
+
+    def __init__(
+        self, latent_channels: int, mapped: int, *, channels: int, width: int, blocks: int
+    ) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
+        self.then, self.now = (nn.Conv2d(mapped, channels, 1) for _ in range(2))
+        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
+        self.head = MatrixConv(channels, channels)
+        self.out = nn.Conv2d(channels, latent_channels, 1)
+        for parameter in self.out.parameters():
+            nn.init.zeros_(parameter)
+
+    def change(self, canvas: Tensor, now: Tensor, vector: Tensor) -> Tensor:
+        """The change of the given latent frame, `[B, C, h, w]`.
+
+        Args:
+            canvas: what all frames start from, `[B, channels, h, w]`.
+            now: the map of what is where in this frame, `[B, mapped, h, w]`.
+            vector: what the blocks are modulated by, `[B, width]`.
+        """
+        grid = (canvas + self.now(now)).contiguous(memory_format=torch.channels_last)
+        for block in self.blocks:
+            grid = block(grid, vector)
+        return self.out(functional.silu(self.head(channel_norm(grid))))
 
 
 class Look(nn.Module):

@@ -6,9 +6,8 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from acwm_recurrent.layers import FilmBlock, MatrixConv, channel_norm
+from acwm_recurrent.layers import FrameDrawing
 from acwm_recurrent.nodes import Form, NodeLayout, View, along_sides, seen_at
 from acwm_recurrent.poses import waves, waves_size
 
@@ -91,7 +90,7 @@ class NodeMap(nn.Module):
         return torch.cat([waves(now / 2, OCTAVES), before, *further], -1)
 
 
-class NodeDrawing(nn.Module):
+class NodeDrawing(FrameDrawing):
     """Draws frames: the given one, with what moved where it is now.
 
     Args:
@@ -115,22 +114,15 @@ class NodeDrawing(nn.Module):
         width: int,
         blocks: int,
     ) -> None:
-        super().__init__()
+        super().__init__(latent_channels, channels, channels=channels, width=width, blocks=blocks)
         self.map = NodeMap(layout, view, stride, channels)
         self.view = view
-        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
         self.look = nn.Sequential(
             nn.Linear(channels + waves_size(2, INSIDE) - 2, channels),
             nn.SiLU(),
             nn.Linear(channels, LOOK),
         )
-        self.then, self.now = (nn.Conv2d(channels, channels, 1) for _ in range(2))
-        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
         self.vector = nn.Parameter(torch.zeros(width))
-        self.head = MatrixConv(channels, channels)
-        self.out = nn.Conv2d(channels, latent_channels, 1)
-        for parameter in self.out.parameters():
-            nn.init.zeros_(parameter)
 
     def canvas(self, base: Tensor, form: Form) -> tuple[Tensor, Tensor]:
         """What all frames start from: the given frame and its form, and how it shows each node.
@@ -159,12 +151,9 @@ class NodeDrawing(nn.Module):
             looks: see `canvas`.
             form: in the video frames of the latent frame, the last one first: `[B, stride, …]`.
         """
-        grid = canvas + self.now(self.map(form, looks, canvas.shape[-2:]))
-        grid = grid.contiguous(memory_format=torch.channels_last)
-        vector = self.vector.expand(len(grid), -1)
-        for block in self.blocks:
-            grid = block(grid, vector)
-        return self.out(functional.silu(self.head(channel_norm(grid))))
+        return self.change(
+            canvas, self.map(form, looks, canvas.shape[-2:]), self.vector.expand(len(canvas), -1)
+        )
 
 
 def _cells(height: int, width: int, like: Tensor) -> Tensor:

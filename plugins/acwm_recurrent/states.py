@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_recurrent.layers import FilmBlock, Look, MatrixConv, channel_norm
+from acwm_recurrent.layers import FrameDrawing, Look
 
 POINTS = 48
 """Places in the picture that a state is read from, beside what the cells show."""
@@ -122,7 +122,7 @@ class StateMotion(nn.Module):
         return torch.cat([other, following + self.follow(other) - self.follow(moved)], -1)
 
 
-class StateDrawing(nn.Module):
+class StateDrawing(FrameDrawing):
     """Draws frames: the given one, with what moves as the states say.
 
     A map of the states is made from few coarse cells; blocks are told of the states too.
@@ -146,18 +146,11 @@ class StateDrawing(nn.Module):
         width: int,
         blocks: int,
     ) -> None:
-        super().__init__()
+        super().__init__(latent_channels, channels, channels=channels, width=width, blocks=blocks)
         self.map = StateMap(states, channels)
-        self.stem = nn.Conv2d(latent_channels, channels, 3, padding=1)
-        self.then, self.now = (nn.Conv2d(channels, channels, 1) for _ in range(2))
         self.tell = nn.Sequential(
             nn.Linear((stride + 1) * states, width), nn.SiLU(), nn.Linear(width, width)
         )
-        self.blocks = nn.ModuleList(FilmBlock(channels, width) for _ in range(blocks))
-        self.head = MatrixConv(channels, channels)
-        self.out = nn.Conv2d(channels, latent_channels, 1)
-        for parameter in self.out.parameters():
-            nn.init.zeros_(parameter)
 
     def canvas(self, base: Tensor, states: Tensor) -> Tensor:
         """What all frames start from, `[B, channels, h, w]`: the given frame and its states."""
@@ -171,12 +164,11 @@ class StateDrawing(nn.Module):
             given: states in the given frame, `[B, S]`.
             states: in the video frames of the latent frame, the last one first: `[B, stride, S]`.
         """
-        grid = canvas + self.now(self.map(states[:, 0], canvas.shape[-2:]))
-        grid = grid.contiguous(memory_format=torch.channels_last)
-        vector = self.tell(torch.cat([given, states.flatten(1)], 1))
-        for block in self.blocks:
-            grid = block(grid, vector)
-        return self.out(functional.silu(self.head(channel_norm(grid))))
+        return self.change(
+            canvas,
+            self.map(states[:, 0], canvas.shape[-2:]),
+            self.tell(torch.cat([given, states.flatten(1)], 1)),
+        )
 
 
 class StateMap(nn.Module):
