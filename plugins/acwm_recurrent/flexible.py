@@ -80,13 +80,15 @@ class FlexibleBody(SceneModel[Scene, Form]):
         eye: where the camera stands, metres.
         target: what it looks at, metres.
         fov: its vertical field of view, degrees.
+        light: direction to the light that casts shadows on the ground z = 0, if they are to be
+            drawn.
         channels: size of the layers that look and draw.
         motion_channels: size of the layers that move nodes.
         width: size of the conditioner's modulation.
         blocks: number of residual blocks that draw.
 
     Raises:
-        RecipeError: a size below 1, or states or a camera that are not these.
+        RecipeError: a size below 1, or states, a camera or a light that are not these.
     """
 
     name = "flexible_body"
@@ -105,6 +107,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
         eye: Sequence[float] = (0.0, -2.2, 4.0),
         target: Sequence[float] = (0.0, -0.08, 0.0),
         fov: float = 33.5,
+        light: Sequence[float] | None = None,
         channels: int = 96,
         motion_channels: int = 64,
         width: int = 192,
@@ -122,6 +125,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
             latent_channels,
             layout,
             view,
+            light,
             stride=temporal_stride,
             channels=channels,
             width=width,
@@ -177,11 +181,11 @@ class FlexibleBody(SceneModel[Scene, Form]):
 
         Nodes are moved by what the agents truly did.
         """
+        true = self.layout.form(states)
         with torch.autocast(states.device.type, enabled=False):
-            true = self.layout.form(states)
             followed = self._agent_loss(true.agents, conditioning, random)
-            window = node_windows(true, random, progress, self.layout.reversible)
-            return followed + self._node_loss(window, random)
+        window = node_windows(true, random, progress, self.layout.reversible)
+        return followed + self._node_loss(window, random)
 
     def told(self, embedded: Tensor) -> Tensor:
         """Embedded actions by video frames; see `StateMotion.told`."""

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from acwm_recurrent.layers import FrameDrawing
-from acwm_recurrent.nodes import Form, NodeLayout, View, along_sides, seen_at
+from acwm_recurrent.nodes import Form, NodeLayout, View, along_sides, facing, seen_at
 from acwm_recurrent.poses import waves, waves_size
+from acwm_recurrent.splatting import Splatting
 
-SIGHTS = (0.5, 0.9, 1.6, 4.0)
-"""How far around it a cell looks, in cells; where it begins to learn."""
-
-VALUES = 32
-"""Values that a node tells the cells, for each of `SIGHTS`."""
+VALUES = 8
+"""Values that a node or an agent tells the pixels where it is."""
 
 OCTAVES = 3
 
@@ -27,61 +26,57 @@ LOOK = 16
 
 
 class NodeMap(nn.Module):
-    """A map of what is where: what the nodes and agents near each cell tell it.
-
-    Each cell looks at the nodes by where they are in the picture, those in front first.
+    """A map of what is where: what nodes and agents tell the cells that they are seen in.
 
     Args:
         layout: of the nodes.
         view: the camera.
+        light: direction to the light whose shadows on the ground it shows, if any.
         stride: video frames per latent frame.
         channels: channels of the map.
     """
 
-    def __init__(self, layout: NodeLayout, view: View, stride: int, channels: int) -> None:
+    def __init__(
+        self,
+        layout: NodeLayout,
+        view: View,
+        light: Sequence[float] | None,
+        *,
+        stride: int,
+        channels: int,
+    ) -> None:
         super().__init__()
         self.layout, self.view = layout, view
         axes, sides, count = layout.axes, len(layout.shape), math.prod(layout.shape)
-        place, before = waves_size(axes, OCTAVES), (stride - 1) * axes
-        told = len(SIGHTS) * (VALUES + 1)
+        place = waves_size(axes, OCTAVES) + (stride - 1) * axes
+        turned = layout.facing_size + 2 * sides * axes
         self.node = nn.Sequential(
-            nn.Linear(place + before + 2 * sides * axes + 2 * LOOK, 2 * channels),
+            nn.Linear(place + turned + 2 * LOOK, 2 * channels),
             nn.SiLU(),
-            nn.Linear(2 * channels, told),
+            nn.Linear(2 * channels, VALUES),
         )
         self.agent = nn.Sequential(
-            nn.Linear(place + before + LOOK, channels), nn.SiLU(), nn.Linear(channels, told)
+            nn.Linear(place + LOOK, channels), nn.SiLU(), nn.Linear(channels, VALUES)
         )
         self.node_look = nn.Parameter(0.3 * torch.randn(count, LOOK))
         self.agent_look = nn.Parameter(0.3 * torch.randn(layout.agents, LOOK))
-        self.spread = nn.Parameter(torch.tensor(SIGHTS).log())
-        self.mix = nn.Linear(len(SIGHTS) * (VALUES + 3), channels)
+        self.splat = Splatting(layout, view, light, frames=stride, values=VALUES)
+        self.mix = nn.Linear(self.splat.channels, channels)
 
     def forward(self, form: Form, looks: Tensor, size: torch.Size) -> Tensor:
         """The map `[B, channels, *size]` of forms in some video frames, the last one first.
 
         `looks`, `[B, N, LOOK]`, is how the given frame shows each node.
         """
-        now, sides = form.at(0), along_sides(form.nodes[:, 0], self.layout.shape)
+        now = form.nodes[:, 0]
         looks = torch.cat([looks, self.node_look.expand(len(looks), -1, -1)], -1)
-        nodes = self._told(form.nodes, [sides, looks])
-        agents = self._told(form.agents, [self.agent_look.expand(len(sides), -1, -1)])
-        told = torch.cat([self.node(nodes), self.agent(agents)], 1).float()
-        told = told.unflatten(2, (len(SIGHTS), VALUES + 1)).transpose(1, 2)  # [B, heads, N, …]
-        height, width = size
-        seen = self.view(torch.cat([now.nodes, now.agents], 1), width / height)
-        cells = _cells(height, width, seen)
-        scale = seen.new_tensor([width / 2, height / 2])
-        spots = seen[..., :2] * scale
-        apart = (cells[:, None] - spots[:, None]).square().sum(-1)
-        spread = self.spread.exp()[:, None, None]
-        near = -apart[:, None] / (2 * spread.square()) + told[..., None, :, -1]
-        near = torch.cat([near, torch.zeros_like(near[..., :1])], -1).softmax(-1)[..., :-1]
-        much = near.sum(-1, keepdim=True)
-        offset = (near @ spots[:, None] - much * cells) / spread
-        heard = torch.cat([near @ told[..., :-1], offset, much], -1)
-        made = self.mix(heard.transpose(1, 2).flatten(2))
-        return made.transpose(1, 2).unflatten(2, size)
+        turned = [sides := along_sides(now, self.layout.shape)]
+        if self.layout.facing_size:
+            turned.append(facing(now, sides, self.view.eye))
+        nodes = self.node(self._told(form.nodes, [*turned, looks]))
+        agents = self.agent(self._told(form.agents, [self.agent_look.expand(len(now), -1, -1)]))
+        heard = self.splat(form, nodes.float(), agents.float(), size)
+        return self.mix(heard).transpose(1, 2).unflatten(2, size)
 
     def _told(self, places: Tensor, further: list[Tensor]) -> Tensor:
         """What is known of things at `[B, frames, N, D]`, of which the last frame is the first."""
@@ -97,6 +92,7 @@ class NodeDrawing(FrameDrawing):
         latent_channels: channels C of the latent.
         layout: of the nodes.
         view: the camera.
+        light: see `NodeMap`.
         stride: video frames per latent frame; a latent frame shows how things move within it.
         channels: channels of the grid.
         width: size of the vector that the blocks are modulated by; it is the same for all frames.
@@ -108,6 +104,7 @@ class NodeDrawing(FrameDrawing):
         latent_channels: int,
         layout: NodeLayout,
         view: View,
+        light: Sequence[float] | None,
         *,
         stride: int,
         channels: int,
@@ -115,7 +112,7 @@ class NodeDrawing(FrameDrawing):
         blocks: int,
     ) -> None:
         super().__init__(latent_channels, channels, channels=channels, width=width, blocks=blocks)
-        self.map = NodeMap(layout, view, stride, channels)
+        self.map = NodeMap(layout, view, light, stride=stride, channels=channels)
         self.view = view
         self.look = nn.Sequential(
             nn.Linear(channels + waves_size(2, INSIDE) - 2, channels),
@@ -154,12 +151,3 @@ class NodeDrawing(FrameDrawing):
         return self.change(
             canvas, self.map(form, looks, canvas.shape[-2:]), self.vector.expand(len(canvas), -1)
         )
-
-
-def _cells(height: int, width: int, like: Tensor) -> Tensor:
-    """Middles of the cells, `[height width, 2]`: right and down, in cells from the middle."""
-    rows, columns = (
-        torch.arange(size, device=like.device) + 0.5 - size / 2 for size in (height, width)
-    )
-    down, right = torch.meshgrid(rows, columns, indexing="ij")
-    return torch.stack([right, down], -1).flatten(0, 1).to(like)

@@ -6,10 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from acwm_recurrent.nodes import Form, NodeBlock, NodeLayout, along_sides
-from acwm_recurrent.poses import waves, waves_size
+from acwm_recurrent.poses import turned_back, waves, waves_size
 
-NEAR, WIDE = 5, 3
-"""Octaves of the Fourier features of the distance to an agent, and of a place in the world."""
+NEAR = 5
+"""Octaves of the Fourier features of the distance to an agent."""
+
+WIDE = {2: 3, 3: 5}
+"""Octaves of those of a place in the world, in the plane and in space, where the ground is near."""
 
 WORLD = 2.0
 """Units that count as one where a place in the world is told: its longest wave has 16 units."""
@@ -23,6 +26,10 @@ REACHES = {1: (1, 2, 4, 8, 1, 2), 2: (1, 2, 4, 1, 2, 4)}
 
 class NodeMotion(nn.Module):
     """Nodes are pushed and held by agents, and pull each other.
+
+    Where there are several agents, all is turned so that the second one is ahead of the first one:
+    a cloth hangs from its grippers alike whichever way they stand. In mixed precision only what
+    nodes hear of each other is rounded, as places in units would lose millimetres.
 
     Args:
         layout: of the nodes.
@@ -38,7 +45,7 @@ class NodeMotion(nn.Module):
             len(layout.shape),
         )
         told = 2 * agents * waves_size(axes, NEAR) + agents * axes + axes
-        told += waves_size(axes, WIDE) + 1 + 2 * sides * axes
+        told += waves_size(axes, WIDE[axes]) + 1 + 2 * sides * axes
         self.tell = nn.Linear(told, channels)
         self.blocks = nn.ModuleList(NodeBlock(sides, channels, each) for each in REACHES[sides])
         self.out = nn.Linear(channels, axes)
@@ -57,7 +64,18 @@ class NodeMotion(nn.Module):
         Returns:
             The new places, and their change.
         """
-        nodes = form.nodes
+        if agents.shape[1] == 1:
+            change = self._changed(form, agents, change)
+        else:
+            ahead = _ahead(form.agents)
+            seen = Form(*(_seen_from(ahead, each) for each in form))
+            agents, change = (_seen_from(ahead, each) for each in (agents, change))
+            back = ahead * ahead.new_tensor([1.0, -1.0])
+            change = _seen_from(back, self._changed(seen, agents, change))
+        return form.nodes + change, change
+
+    def _changed(self, form: Form, agents: Tensor, change: Tensor) -> Tensor:
+        nodes, exact = form.nodes, torch.autocast(agents.device.type, enabled=False)
         away = [
             waves(each[:, None, number] - nodes, NEAR)
             for each in (form.agents, agents)
@@ -68,12 +86,24 @@ class NodeMotion(nn.Module):
             *away,
             moved,
             change / STEP,
-            waves(nodes / WORLD, WIDE),
+            waves(nodes / WORLD, WIDE[nodes.shape[2]]),
             torch.ones_like(nodes[..., :1]),
             along_sides(nodes, self.shape),
         ]
-        features = self.tell(torch.cat(told, -1))
+        with exact:
+            features = self.tell(torch.cat(told, -1))
         for block in self.blocks:
             features = block(features, self.shape)
-        change = self.keep * change + STEP * self.out(nn.functional.silu(features))
-        return nodes + change, change
+        with exact:
+            made = self.out(nn.functional.silu(features.float()))
+        return self.keep * change + STEP * made
+
+
+def _ahead(agents: Tensor) -> Tensor:
+    """The horizontal direction from the first agent to the second one, `[B, 1, 2]`."""
+    return nn.functional.normalize(agents[:, 1:2, :2] - agents[:, :1, :2], dim=-1, eps=1e-6)
+
+
+def _seen_from(ahead: Tensor, places: Tensor) -> Tensor:
+    """Places `[B, N, D]` where `ahead` is along x."""
+    return torch.cat([turned_back(places[..., :2], ahead), places[..., 2:]], -1)

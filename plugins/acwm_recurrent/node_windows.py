@@ -12,7 +12,7 @@ from acwm_recurrent.nodes import Form
 HORIZONS = ((0.3, 4), (0.6, 8), (1.0, 16))
 """Until which share of the training windows have so many frames."""
 
-NODES = 40_000
+NODES = 12_000
 """Nodes in all frames of all windows of a step together."""
 
 STILL = 0.1

@@ -79,6 +79,11 @@ class NodeLayout:
         self.axes = int(axes) or 2
 
     @property
+    def facing_size(self) -> int:
+        """Number of values that `facing` tells of each node; 0 of a rope, or in the plane."""
+        return 4 if len(self.shape) == 2 and self.axes == 3 else 0
+
+    @property
     def reversible(self) -> bool:
         """Whether the nodes may be counted from either end, which look alike."""
         return len(self.shape) == 1
@@ -138,7 +143,8 @@ class View(nn.Module):
         """
         if places.shape[-1] == 2:
             places = torch.cat([places, torch.zeros_like(places[..., :1])], -1)
-        right, down, depth = ((places - self.eye) @ self.axes.T).unbind(-1)
+        # Not a matrix product, which mixed precision would round.
+        right, down, depth = ((places - self.eye)[..., None, :] * self.axes).sum(-1).unbind(-1)
         depth = depth.clamp(min=1e-3)
         return torch.stack([right / depth / aspect, down / depth, depth], -1)
 
@@ -157,6 +163,24 @@ def along_sides(nodes: Tensor, shape: tuple[int, ...]) -> Tensor:
         steps, none = grid.diff(dim=side), torch.zeros_like(grid.narrow(side, 0, 1))
         found += [torch.cat([steps, none], side), torch.cat([none, -steps], side)]
     return torch.cat(found, -1).flatten(1, len(shape))
+
+
+def facing(nodes: Tensor, sides: Tensor, eye: Tensor) -> Tensor:
+    """How a cloth faces the camera at each node, `[B, N, 4]`.
+
+    Args:
+        nodes: places in units, `[B, N, 3]`.
+        sides: what `along_sides` makes of them.
+        eye: where the camera stands, in units.
+
+    Returns:
+        The unit normal, and its part along the line of sight.
+    """
+    after, before = sides.unflatten(2, (2, 2, -1)).unbind(3)
+    down, across = (after - before).unbind(2)
+    normal = nn.functional.normalize(torch.linalg.cross(across, down), dim=-1, eps=1e-4)
+    sight = nn.functional.normalize(nodes - eye, dim=-1)
+    return torch.cat([normal, (normal * sight).sum(-1, keepdim=True)], -1)
 
 
 class NodeBlock(nn.Module):

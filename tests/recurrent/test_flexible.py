@@ -10,6 +10,7 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_recurrent import node_windows as node_windows_module
 from acwm_recurrent.flexible import FlexibleBody
+from acwm_recurrent.node_motion import NodeMotion
 from acwm_recurrent.node_sight import NodeSight, form_loss
 from acwm_recurrent.node_windows import node_windows
 from acwm_recurrent.nodes import Form, NodeLayout, View
@@ -77,6 +78,36 @@ def test_the_view_is_that_of_the_renderer(aspect):
     )
     with pytest.raises(RecipeError, match="two different places"):
         View(EYE, EYE, FOV, 0.1)
+
+
+def test_mixed_precision_moves_no_place_in_the_picture():
+    points = 5 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    view = View(EYE, TARGET, FOV, 0.1)
+    exact = view(points, 1.0)
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(view(points, 1.0), exact)
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16])
+def test_a_cloth_moves_alike_whichever_way_its_grippers_stand(precision):
+    torch.manual_seed(0)
+    motion = NodeMotion(NodeLayout(2, [5, 5], 1, 0.1, 81), 32)
+    torch.nn.init.normal_(motion.out.weight, std=0.3)
+    sizes = ((3, 2, 3), (3, 25, 3), (3, 2, 3), (3, 25, 3))  # was, nodes, agents, change
+    things = [torch.randn(size) for size in sizes]
+    angle = torch.tensor(1.1)
+    rows = [[angle.cos(), angle.sin(), 0], [-angle.sin(), angle.cos(), 0], [0, 0, 1]]
+    turn = torch.tensor(rows)
+
+    def moved(was, nodes, agents, change):
+        with torch.autocast("cpu", precision, enabled=precision != torch.float32):
+            return motion(Form(was, nodes), agents, change)[0]
+
+    straight, turned = moved(*things), moved(*(each @ turn for each in things))
+    assert (straight - things[1]).abs().mean() > 0.1
+    torch.testing.assert_close(straight @ turn, turned, atol=1e-2, rtol=0)
+    if precision == torch.float32:
+        torch.testing.assert_close(straight @ turn, turned, atol=1e-5, rtol=1e-5)
 
 
 def test_windows_are_seen_from_other_sides_and_ends():

@@ -64,16 +64,6 @@ def data_of(tmp_path_factory):
     return made
 
 
-CLOTH = (
-    "data.states=[gripper_position,cloth_position]",
-    "model.agents=2",
-    "model.nodes=[21,21]",
-    "model.eye=[0,-2.15,1.55]",
-    "model.target=[0,0,0.33]",
-    "model.fov=39",
-)
-
-
 @pytest.mark.parametrize(
     ("recipe", "words"),
     [
@@ -91,7 +81,7 @@ CLOTH = (
         ("push_cube", ("+small", "+recurrent", "+planar_bodies")),
         ("robot_arm", ("+small", "+recurrent", "+drawn_states")),
         ("push_rope", ("+small", "+recurrent", "+flexible_body")),
-        ("cloth_move", ("+small", "+recurrent", "+flexible_body", *CLOTH)),
+        ("cloth_move", ("+small", "+recurrent", "+flexible_cloth")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )
