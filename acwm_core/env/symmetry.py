@@ -33,6 +33,8 @@ class Symmetry:
             so simply are left out.
         headings: fields of the state that hold angles in the plane of the frame, in rad and
             counter-clockwise from the right. They turn with it.
+        repainted: instances whose colours change, and change back when it is done twice, as those
+            of a cloth whose sides change places.
 
     Raises:
         ShapeError: it is none, or the identity of frames.
@@ -43,6 +45,7 @@ class Symmetry:
     quarter_turns: int = 0
     states: Mapping[str, Axes] = field(default_factory=dict[str, Axes])
     headings: tuple[str, ...] = ()
+    repainted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.quarter_turns not in range(4) or not (self.mirrored or self.quarter_turns):
@@ -112,7 +115,8 @@ class Symmetry:
         headings = tuple(name for name in self.headings if name in first.headings)
         mirrored = self.mirrored != first.mirrored
         if mirrored or turns:
-            return Symmetry(actions, mirrored, turns, states, headings)
+            repainted = tuple(sorted(set(self.repainted) ^ set(first.repainted)))
+            return Symmetry(actions, mirrored, turns, states, headings, repainted)
         if any(axes != tuple(range(1, len(axes) + 1)) for axes in (actions, *states.values())):
             raise ShapeError(
                 f"{self.name} after {first.name} leaves frames as they are and changes actions or "
@@ -125,8 +129,8 @@ class Symmetry:
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON or YAML."""
         states = {name: tuple(axes) for name, axes in values.get("states", {}).items()}
         of_frames = {name: values[name] for name in ("mirrored", "quarter_turns") if name in values}
-        headings = tuple(values.get("headings", ()))
-        return cls(tuple(values["actions"]), states=states, headings=headings, **of_frames)
+        names = {name: tuple(values.get(name, ())) for name in ("headings", "repainted")}
+        return cls(tuple(values["actions"]), states=states, **names, **of_frames)
 
 
 def permuted(values: NDArray[Any], axes: Axes) -> NDArray[Any]:

@@ -150,6 +150,11 @@ class Cloth:
         for points in (self.nodes, self.hands):
             points[:, :2] += inward
 
+    def mirror(self) -> None:
+        """Mirror cloth and grippers, left to right."""
+        for vectors in (self.nodes, self.velocities, self.hands, self._offset):
+            vectors[:, 0] *= -1
+
     def _run(self, substeps: int) -> None:
         self._launch(
             self.nodes,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor
+from acwm_core.env.symmetry import Symmetry
 from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_drawing import CLOTH_ID, HAND_ID, SPHERE_ID, ClothDrawing
 from acwm_deformable.cloth_policy import Carrier, TwoArms
@@ -88,6 +89,17 @@ _LIMITS = {
 """The factor values that the simulation accepts."""
 
 
+_MIRROR = Symmetry(
+    (-1, 2, 3),
+    mirrored=True,
+    states={
+        name: (-1, 2, 3)
+        for name in ("cloth_position", "cloth_velocity", "gripper_position", "sphere_position")
+    },
+    repainted=("cloth",),  # its bright and its dark side change places
+)
+
+
 def _state_fields() -> tuple[StateField, ...]:
     points, speeds = (len(range(0, NODES, s)) for s in (_NODE_STRIDE, _VELOCITY_STRIDE))
     return (
@@ -144,6 +156,7 @@ class ClothMove(SceneEnvironment[Cloth]):
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         variants=("cloth_move_8d",),
         citation="ACWM-Phys, arXiv:2605.08567",
+        symmetries=(_MIRROR,),
     )
     together = True
     longest_step = MAX_STEP
@@ -161,6 +174,9 @@ class ClothMove(SceneEnvironment[Cloth]):
     def _perturb(self, amount: float, rng: np.random.Generator) -> None:
         """Move grippers and cloth as a whole, and rotate them about the vertical."""
         self.simulation.displace(amount * rng.normal(0, 1e-3, 2), amount * rng.normal(0, 1e-3))
+
+    def _transform(self, symmetry: Symmetry) -> None:
+        self.simulation.mirror()
 
     def _advance(self, action: NDArray[np.float32]) -> None:
         self.simulation.advance(np.tile(action, (2, 1)), 1 / self.card.fps)
@@ -218,6 +234,7 @@ class ClothMove8D(ClothMove):
             kind="delta",
         ),
         variants=(),
+        symmetries=(replace(_MIRROR, actions=(-1, 2, 3, 4, -5, 6, 7, 8)),),
     )
     together = False
 

@@ -21,6 +21,7 @@ DECLARED = {
     "push_rope": 1,
     "push_sand": 1,
     "reacher": 1,
+    "cloth_move": 1,
 }
 """How many symmetries each world has, besides leaving all as it is; the others have none."""
 
@@ -99,3 +100,10 @@ def test_a_card_keeps_its_symmetries_in_json():
 def test_what_is_no_symmetry_is_refused(wrong):
     with pytest.raises(ShapeError):
         wrong()
+
+
+def test_a_mirrored_world_may_repaint_what_its_card_says():
+    both = Symmetry((-1, 2), mirrored=True, repainted=("cloth",))
+    assert Symmetry.from_dict(json.loads(json.dumps(asdict(both)))) == both
+    (mirrored, halfway, turned) = group(both, Symmetry((-1, -2), quarter_turns=2))
+    assert [each.repainted for each in (mirrored, halfway, turned)] == [("cloth",), ("cloth",), ()]
