@@ -164,6 +164,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
         forms = self.sight(looked)
         shown = shown.reversed(self._turned_round(forms[-1], shown))
         loss = torch.stack([form_loss(each, shown).mean() for each in forms]).mean()
+        loss = loss + self.sight.agents.stray(looked, shown.agents)
         if not self.node_motion.out.weight.requires_grad:
             return loss
         random = batch.generators[0]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from acwm_recurrent.nodes import Form, NodeBlock, NodeLayout, along_sides
-from acwm_recurrent.poses import turned_back, waves, waves_size
+from acwm_recurrent.nodes import Form, NodeBlock, NodeLayout, ahead_of, along_sides, seen_from
+from acwm_recurrent.poses import waves, waves_size
 
 NEAR = 5
 """Octaves of the Fourier features of the distance to an agent."""
@@ -67,11 +67,11 @@ class NodeMotion(nn.Module):
         if agents.shape[1] == 1:
             change = self._changed(form, agents, change)
         else:
-            ahead = _ahead(form.agents)
-            seen = Form(*(_seen_from(ahead, each) for each in form))
-            agents, change = (_seen_from(ahead, each) for each in (agents, change))
+            ahead = ahead_of(form.agents)
+            seen = Form(*(seen_from(ahead, each) for each in form))
+            agents, change = (seen_from(ahead, each) for each in (agents, change))
             back = ahead * ahead.new_tensor([1.0, -1.0])
-            change = _seen_from(back, self._changed(seen, agents, change))
+            change = seen_from(back, self._changed(seen, agents, change))
         return form.nodes + change, change
 
     def _changed(self, form: Form, agents: Tensor, change: Tensor) -> Tensor:
@@ -97,13 +97,3 @@ class NodeMotion(nn.Module):
         with exact:
             made = self.out(nn.functional.silu(features.float()))
         return self.keep * change + STEP * made
-
-
-def _ahead(agents: Tensor) -> Tensor:
-    """The horizontal direction from the first agent to the second one, `[B, 1, 2]`."""
-    return nn.functional.normalize(agents[:, 1:2, :2] - agents[:, :1, :2], dim=-1, eps=1e-6)
-
-
-def _seen_from(ahead: Tensor, places: Tensor) -> Tensor:
-    """Places `[B, N, D]` where `ahead` is along x."""
-    return torch.cat([turned_back(places[..., :2], ahead), places[..., 2:]], -1)

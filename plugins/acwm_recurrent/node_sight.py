@@ -8,8 +8,19 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from acwm_recurrent.agent_sight import AgentSight
 from acwm_recurrent.layers import Look
-from acwm_recurrent.nodes import Form, NodeBlock, NodeLayout, View, along_sides, seen_at
+from acwm_recurrent.nodes import (
+    Form,
+    NodeBlock,
+    NodeLayout,
+    View,
+    ahead_of,
+    along_sides,
+    evenly,
+    seen_at,
+    seen_from,
+)
 from acwm_recurrent.poses import waves, waves_size
 
 POINTS, CELLS, HIDDEN, OCTAVES = 32, 4, 256, 3
@@ -25,7 +36,7 @@ class NodeSight(Look):
     """Guesses from the whole frame where things are, then looks there and corrects itself.
 
     So a snake finds a contour (Kass et al. 1988): what the picture shows at each node, and where
-    its neighbours are, tell where it should move.
+    its neighbours are, tell where it should move. The nodes of a rope are kept at equal distances.
 
     Args:
         latent_channels: channels C of the latent.
@@ -38,7 +49,6 @@ class NodeSight(Look):
         super().__init__(latent_channels, channels)
         self.layout, self.view = layout, view
         axes, sides = layout.axes, len(layout.shape)
-        values = (layout.agents + math.prod(layout.shape)) * axes
         self.where = nn.Conv2d(channels, POINTS, 1)
         self.what = nn.Conv2d(channels, 32, 1)
         self.guess = nn.Sequential(
@@ -46,8 +56,9 @@ class NodeSight(Look):
             nn.SiLU(),
             nn.Linear(HIDDEN, HIDDEN),
             nn.SiLU(),
-            nn.Linear(HIDDEN, values),
         )
+        self.guess_nodes = nn.Linear(HIDDEN, math.prod(layout.shape) * axes)
+        self.agents = AgentSight(latent_channels, layout, view, HIDDEN)
         place = waves_size(axes, OCTAVES)
         self.agent = nn.Sequential(
             nn.Linear(channels + place, channels), nn.SiLU(), nn.Linear(channels, axes)
@@ -59,12 +70,15 @@ class NodeSight(Look):
     def forward(self, frame: Tensor) -> list[Form]:
         """The forms that a latent frame `[B, C, h, w]` shows: the first guess to the last one."""
         grid = self.features(frame)
-        forms = [self._guessed(grid)]
+        hidden = self.guess(self._summary(grid))
+        agents = self.agents(frame, hidden)
+        forms = [Form(agents, self._guessed(hidden, agents))]
         for _ in range(ROUNDS):
             forms.append(self._corrected(grid.float(), forms[-1]))
         return forms
 
-    def _guessed(self, grid: Tensor) -> Form:
+    def _summary(self, grid: Tensor) -> Tensor:
+        """Where things are, and what is seen in a few large cells, `[B, …]`."""
         height, width = grid.shape[2:]
         looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
         rows, columns = (
@@ -72,10 +86,16 @@ class NodeSight(Look):
         )
         places = torch.cat([looks.sum(3) @ rows[:, None], looks.sum(2) @ columns[:, None]], 2)
         cells = functional.adaptive_avg_pool2d(self.what(grid), CELLS)
-        made = SPREAD * self.guess(torch.cat([places.flatten(1), cells.flatten(1)], 1)).float()
-        made = made.unflatten(1, (-1, self.layout.axes))
-        agents = self.layout.agents
-        return Form(made[:, :agents], made[:, agents:])
+        return torch.cat([places.flatten(1), cells.flatten(1)], 1)
+
+    def _guessed(self, hidden: Tensor, agents: Tensor) -> Tensor:
+        """A first guess of the nodes, as they are seen from the agents where there are several."""
+        nodes = SPREAD * self.guess_nodes(hidden).float().unflatten(1, (-1, self.layout.axes))
+        if agents.shape[1] > 1:
+            agents = agents.detach()  # they are not learned by what hangs from them
+            back = ahead_of(agents) * agents.new_tensor([1.0, -1.0])
+            nodes = agents.mean(1, keepdim=True) + seen_from(back, nodes)
+        return self._evenly(nodes)
 
     def _corrected(self, grid: Tensor, form: Form) -> Form:
         agents, nodes = (each.detach() for each in form)  # where it looks is not learned by looking
@@ -85,8 +105,11 @@ class NodeSight(Look):
         features = self.tell(torch.cat([shown, waves(nodes / 2, OCTAVES), sides], -1))
         for block in self.blocks:
             features = block(features, self.layout.shape)
-        moved = self.shift(functional.silu(features))
-        return Form(form.agents + shift.float(), form.nodes + moved.float())
+        moved = form.nodes + self.shift(functional.silu(features)).float()
+        return Form(form.agents + shift.float(), self._evenly(moved))
+
+    def _evenly(self, nodes: Tensor) -> Tensor:
+        return evenly(nodes) if len(self.layout.shape) == 1 else nodes
 
     def _seen(self, grid: Tensor, places: Tensor) -> Tensor:
         """What the frame shows at places `[B, N, D]`: `[B, N, channels]`."""

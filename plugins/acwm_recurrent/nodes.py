@@ -10,6 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_recurrent.poses import turned_back
+
+EVEN = 2
+"""How often nodes are put at equal distances; each time the line gets a little shorter."""
+
+HORIZON = 1e-2
+"""How far below the horizon the ground is seen at least, in units a unit away."""
 
 
 class Form(NamedTuple):
@@ -112,6 +119,7 @@ class View(nn.Module):
     """
 
     axes: Tensor
+    back: Tensor
     eye: Tensor
 
     def __init__(
@@ -132,6 +140,7 @@ class View(nn.Module):
         scale = 1 / math.tan(math.radians(fov) / 2)
         rows = rows * torch.tensor([[scale], [scale], [1.0]], dtype=torch.float64)
         self.register_buffer("axes", rows.float(), persistent=False)
+        self.register_buffer("back", torch.linalg.inv(rows).float(), persistent=False)
         self.register_buffer("eye", torch.tensor(eye).float() / unit, persistent=False)
 
     def forward(self, places: Tensor, aspect: float) -> Tensor:
@@ -147,6 +156,19 @@ class View(nn.Module):
         right, down, depth = ((places - self.eye)[..., None, :] * self.axes).sum(-1).unbind(-1)
         depth = depth.clamp(min=1e-3)
         return torch.stack([right / depth / aspect, down / depth, depth], -1)
+
+    def places(self, seen: Tensor, aspect: float) -> Tensor:
+        """The inverse: the places `[…, 3]` in units that are seen there, so far away."""
+        right, down, depth = seen.unbind(-1)
+        ray = torch.stack([right * depth * aspect, down * depth, depth], -1)
+        return (ray[..., None, :] * self.back).sum(-1) + self.eye
+
+    def on_ground(self, spots: Tensor, aspect: float) -> Tensor:
+        """The places `[…, 2]` on the plane z = 0 that are seen at spots `[…, 2]`."""
+        seen = torch.cat([spots, torch.ones_like(spots[..., :1])], -1)
+        ray = self.places(seen, aspect) - self.eye
+        far = -self.eye[2] / ray[..., 2:].clamp(max=-HORIZON)
+        return (self.eye + far * ray)[..., :2]
 
 
 def seen_at(grid: Tensor, spots: Tensor) -> Tensor:
@@ -181,6 +203,31 @@ def facing(nodes: Tensor, sides: Tensor, eye: Tensor) -> Tensor:
     normal = nn.functional.normalize(torch.linalg.cross(across, down), dim=-1, eps=1e-4)
     sight = nn.functional.normalize(nodes - eye, dim=-1)
     return torch.cat([normal, (normal * sight).sum(-1, keepdim=True)], -1)
+
+
+def ahead_of(agents: Tensor) -> Tensor:
+    """The horizontal direction from the first agent to the second one, `[B, 1, 2]`."""
+    return nn.functional.normalize(agents[:, 1:2, :2] - agents[:, :1, :2], dim=-1, eps=1e-6)
+
+
+def seen_from(ahead: Tensor, places: Tensor) -> Tensor:
+    """Places `[B, N, D]` where `ahead` is along x."""
+    return torch.cat([turned_back(places[..., :2], ahead), places[..., 2:]], -1)
+
+
+def evenly(nodes: Tensor) -> Tensor:
+    """A line of nodes `[B, N, D]`, with these at equal distances along it."""
+    share = torch.linspace(0, 1, nodes.shape[1], device=nodes.device)
+    for _ in range(EVEN):
+        steps = nodes.diff(dim=1)
+        far = steps.norm(dim=-1).clamp(min=1e-6)
+        after = far.cumsum(1)
+        wanted = share * after[:, -1:]
+        step = (wanted[:, :, None] > after[:, None, :-1]).sum(-1)
+        part = (wanted - (after - far).gather(1, step)) / far.gather(1, step)
+        step = step[..., None].expand(-1, -1, nodes.shape[2])
+        nodes = nodes[:, :-1].gather(1, step) + part[..., None] * steps.gather(1, step)
+    return nodes
 
 
 class NodeBlock(nn.Module):

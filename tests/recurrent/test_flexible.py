@@ -9,11 +9,12 @@ import torch
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_recurrent import node_windows as node_windows_module
+from acwm_recurrent.agent_sight import AgentSight
 from acwm_recurrent.flexible import FlexibleBody
 from acwm_recurrent.node_motion import NodeMotion
 from acwm_recurrent.node_sight import NodeSight, form_loss
 from acwm_recurrent.node_windows import node_windows
-from acwm_recurrent.nodes import Form, NodeLayout, View
+from acwm_recurrent.nodes import Form, NodeLayout, View, evenly
 from acwm_sim.camera import Camera
 from tests.recurrent.dots import world_of
 
@@ -76,8 +77,66 @@ def test_the_view_is_that_of_the_renderer(aspect):
     torch.testing.assert_close(
         seen, torch.tensor(expected, dtype=torch.float32), rtol=1e-3, atol=1e-3
     )
+    torch.testing.assert_close(
+        View(EYE, TARGET, FOV, 0.1).places(seen, aspect) / 10,
+        torch.tensor(points, dtype=torch.float32),
+        rtol=1e-4,
+        atol=1e-4,
+    )
     with pytest.raises(RecipeError, match="two different places"):
         View(EYE, EYE, FOV, 0.1)
+
+
+def test_what_lies_on_the_ground_is_found_there():
+    view, places = View(EYE, TARGET, FOV, 0.1), 10 * torch.randn(7, 2)
+    spots = view(places, 1.5)[..., :2]
+    torch.testing.assert_close(view.on_ground(spots, 1.5), places, rtol=1e-3, atol=1e-3)
+    above_the_horizon = view.on_ground(torch.tensor([0.0, -9.0]), 1.5)
+    assert above_the_horizon.isfinite().all()
+
+
+def test_nodes_are_put_at_equal_distances_along_their_line():
+    """Against NumPy's interpolation of both coordinates along the length."""
+    x = torch.tensor([0.0, 0.1, 0.2, 1.5, 2.0, 2.1, 4.0])
+    line = torch.stack([x, 0.3 * x.sin()], -1)
+    even = evenly(line[None])[0]
+    far = np.append(0, np.hypot(*np.diff(line.numpy(), axis=0).T).cumsum())
+    wanted = np.linspace(0, far[-1], 7)
+    expected = np.stack([np.interp(wanted, far, each) for each in line.numpy().T], -1)
+    np.testing.assert_allclose(even, expected, atol=0.03)
+    np.testing.assert_allclose(even[[0, -1]], line[[0, -1]], atol=1e-6)
+    steps = even.diff(dim=0).norm(dim=-1)
+    assert steps.std() < 1e-3 * steps.mean()
+
+
+def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
+    """In all of the training the first agent is on the left."""
+    torch.manual_seed(0)
+    layout, view = NodeLayout(2, [3], 1, 1.0, 2 * 5), View(EYE, TARGET, FOV, 1.0)
+    sight = AgentSight(2, layout, view, 4)
+    optimizer = torch.optim.AdamW(sight.parameters(), 1e-2)
+
+    def pictures(left):
+        spots = torch.rand(32, 2, 2) * 0.8 + 0.1
+        spots[:, left, 0] *= -1
+        rows, columns = (((each + 1) * 8).long() for each in (spots[..., 1], spots[..., 0]))
+        frames = torch.zeros(32, 2, 16, 16)
+        for agent in range(2):
+            frames[torch.arange(32), agent, rows[:, agent], columns[:, agent]] = 1
+        middles = (torch.stack([columns, rows], -1) + 0.5) / 8 - 1
+        return frames, view.on_ground(middles, 1.0)
+
+    def missed(frames, true):
+        return (sight(frames, torch.zeros(32, 4)) - true).norm(dim=-1).mean()
+
+    for _ in range(60):
+        frames, true = pictures(left=0)
+        optimizer.zero_grad()
+        (missed(frames, true) + sight.stray(frames, true)).backward()
+        optimizer.step()
+    with torch.no_grad():
+        assert missed(*pictures(left=0)) < 0.2
+        assert missed(*pictures(left=1)) < 0.2
 
 
 def test_mixed_precision_moves_no_place_in_the_picture():
