@@ -28,7 +28,7 @@ class AgentSight(nn.Module):
 
     def __init__(self, latent_channels: int, layout: NodeLayout, view: View, hidden: int) -> None:
         super().__init__()
-        self.axes, self.view = layout.axes, view
+        self.view = view
         self.near = nn.Sequential(
             # Zeros around the frame would tell where a cell is.
             nn.Conv2d(latent_channels, NEAR, 3, padding=1, padding_mode="replicate"),
@@ -36,9 +36,9 @@ class AgentSight(nn.Module):
             nn.Conv2d(NEAR, NEAR, 1),
             nn.SiLU(),
         )
-        self.spot = nn.Conv2d(NEAR, layout.agents, 1)
-        self.shift = nn.Sequential(nn.Linear(NEAR, NEAR), nn.SiLU(), nn.Linear(NEAR, 3))
-        self.far = nn.Linear(hidden, layout.agents)
+        self.spot = nn.Conv2d(NEAR, layout.agents, 1, bias=False)
+        self.shift = nn.Sequential(nn.Linear(NEAR, NEAR), nn.SiLU(), nn.Linear(NEAR, layout.axes))
+        self.far = nn.Linear(hidden, layout.agents) if layout.axes == 3 else None
 
     def forward(self, frame: Tensor, hidden: Tensor) -> Tensor:
         """Where agents are, `[B, A, D]` in units.
@@ -51,7 +51,7 @@ class AgentSight(nn.Module):
         spots = self._shares(near) @ cell_places(frame)
         shift = self.shift(seen_at(near.float(), spots)).float()
         spots = spots + ASIDE * shift[..., :2]
-        if self.axes == 2:
+        if self.far is None:
             return self.view.on_ground(spots, aspect)
         far = shift[..., 2:] + self.far(hidden).float()[..., None]
         seen = torch.cat([spots, self.view.eye.norm() + APART * far], -1)

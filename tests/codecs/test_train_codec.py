@@ -122,12 +122,17 @@ def test_a_training_that_was_stored_goes_on_as_if_nothing_had_happened(tmp_path,
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Runs the command on an episode of reacher."""
+    """Runs the command on an episode of push_cube."""
     pytest.importorskip("mujoco")
     monkeypatch.setattr(train_codec, "MEASURED_BATCHES", 2)
     monkeypatch.chdir(tmp_path)
     generate(
-        "reacher", tmp_path / "d", episodes={"train": 1, "ind_test": 1}, seed=3, size=64, workers=0
+        "push_cube",
+        tmp_path / "d",
+        episodes={"train": 1, "ind_test": 1},
+        seed=3,
+        size=64,
+        workers=0,
     )
 
     def run(out, *words, refused=False):
@@ -143,10 +148,10 @@ def run(tmp_path, monkeypatch):
 @pytest.mark.ci
 def test_a_decoder_learns_from_what_a_model_predicts(run, tmp_path):
     from_models = ["--codec", "compact_reference", "--start", "compact", "--predicted-by"]
-    run("own.safetensors", *from_models, "reacher")
+    run("own.safetensors", *from_models, "push_cube")
     record = training_record(tmp_path / "own.safetensors")
     assert record["decoder_only"]
-    assert [each["model"] for each in record["predicted_by"]] == ["reacher"]
+    assert [each["model"] for each in record["predicted_by"]] == ["push_cube"]
     trained = CompactReference(weights=str(tmp_path / "own.safetensors"))
     video = torch.rand(1, 5, 3, 64, 64)
     assert torch.equal(trained.encode(video), Compact().encode(video))
@@ -162,9 +167,9 @@ def test_a_decoder_learns_from_what_a_model_predicts(run, tmp_path):
     for words, says in (
         (["--freeze-coarse"], "goes with --codec compact_reference"),
         (["--freeze-coarse", *from_own], "only the coarse layers that ship"),
-        (["--codec", "fine", "--predicted-by", "reacher"], "the latents of another codec"),
-        ([*from_models, "push_cube"], "push_cube at 64×64, of which there are no data"),
-        (["--predicted-by", "reacher", "--start", "random"], "not --start random"),
+        (["--codec", "fine", "--predicted-by", "push_cube"], "the latents of another codec"),
+        ([*from_models, "cloth_move"], "cloth_move at 64×64, of which there are no data"),
+        (["--predicted-by", "push_cube", "--start", "random"], "not --start random"),
         (["--codec", "compact", "--start", "fine"], "do not fit into compact"),
     ):
         assert says in run("other.safetensors", *words, refused=True)
@@ -179,7 +184,7 @@ def test_the_command_goes_on_from_weights_and_records_the_way(run, tmp_path):
     assert (record["seed"], record["steps"], record["start"]["seed"]) == (5, 2, 0)
     assert record["start"]["start"] == "random"
     assert record["data"] == [
-        {"environment": "reacher", "frame_size": [64, 64], "seed": 3, "episodes": 1}
+        {"environment": "push_cube", "frame_size": [64, 64], "seed": 3, "episodes": 1}
     ]
     Compact(weights=str(tmp_path / "two.safetensors"))
     told = run("three.safetensors", "--decoder-only")  # from the weights that ship
