@@ -226,8 +226,8 @@ class EnvironmentChecks(TaskChecks):
         for name, axes in symmetry.states.items():
             wanted = permuted(np.asarray(usual.states[name], np.float64), axes)
             error = np.abs(turned.states[name] - wanted).max()
-            doubt = DOUBT * self._spread.get(name, 0.0)
-            if error > max(OFF * np.abs(wanted).max() + 1e-6, doubt):
+            differs = error > OFF * np.abs(wanted).max() + 1e-6
+            if differs and error > DOUBT * self._spread.get(name, 0.0):
                 return f"state {name!r} differs by {error:.2g}"
         for name in symmetry.headings:
             wanted = symmetry.of_states(name, np.asarray(usual.states[name], np.float64))
@@ -236,15 +236,15 @@ class EnvironmentChecks(TaskChecks):
                 return f"state {name!r} differs by {np.abs(off).max():.2g} rad"
         masks = symmetry.of_frames(usual.masks)
         colours = symmetry.of_frames(np.moveaxis(usual.video, -1, 1))
-        differs = np.abs(colours.astype(float) - np.moveaxis(turned.video, -1, 1)).mean(1) / 255
+        unlike = np.abs(colours.astype(float) - np.moveaxis(turned.video, -1, 1)).mean(1) / 255
         for number, name in enumerate(self.card.instances):
             here, there = masks == number, turned.masks == number
             both, either = here & there, here | there
             if either.any() and both.sum() < OVERLAP * either.sum():
                 return f"masks of {name!r} overlap by {both.sum() / either.sum():.0%}"
             painted = both.any() and name not in symmetry.repainted
-            if painted and differs[both].mean() > PAINT:
-                return f"the colour of {name!r} differs by {differs[both].mean():.0%}"
+            if painted and unlike[both].mean() > PAINT:
+                return f"the colour of {name!r} differs by {unlike[both].mean():.0%}"
         return ""
 
     def factors_matter(self) -> None:

@@ -15,7 +15,7 @@ ASIDE, APART = 0.1, 2.0
 
 
 class AgentSight(nn.Module):
-    """Tells agents by what a cell and those around it show, and nothing else.
+    """Finds agents in the picture by what a cell and those around it show, and nothing else.
 
     So it knows a gripper by its colour, and not by the side on which it was in the training.
 

@@ -13,6 +13,9 @@ KERNEL = 3
 START_GATE = 0.3
 """Initial weight of a block's residual branch."""
 
+CELLS, COARSE = 4, 32
+"""Cells per side that a whole frame is summed up in, and values of each."""
+
 
 class MatrixConv(nn.Module):
     """A 3×3 convolution whose weight is one matrix, `[out, in · 9]`, as Muon requires.
@@ -126,6 +129,39 @@ class Look(nn.Module):
         for layer in self.layers:
             grid = grid + layer(grid)
         return functional.silu(grid)
+
+
+class Overview(Look):
+    """A look that sums up the whole frame.
+
+    By where things are, a softmax over the cells for each of `points` (Finn et al. 2016, arXiv
+    1509.06113), and by what coarse cells show.
+
+    Args:
+        latent_channels: channels C of the latent.
+        channels: channels of its convolutions.
+        points: places in the picture that are told.
+
+    Attributes:
+        size: number of values of `summary`.
+    """
+
+    def __init__(self, latent_channels: int, channels: int, points: int) -> None:
+        super().__init__(latent_channels, channels)
+        self.where = nn.Conv2d(channels, points, 1)
+        self.what = nn.Conv2d(channels, COARSE, 1)
+        self.size = 2 * points + COARSE * CELLS**2
+
+    def summary(self, grid: Tensor) -> Tensor:
+        """What features of the cells `[B, channels, h, w]` say of the whole frame, `[B, size]`."""
+        height, width = grid.shape[2:]
+        looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
+        rows, columns = (
+            torch.linspace(-1, 1, size, device=grid.device) for size in (height, width)
+        )
+        places = torch.cat([looks.sum(3) @ rows[:, None], looks.sum(2) @ columns[:, None]], 2)
+        cells = functional.adaptive_avg_pool2d(self.what(grid), CELLS)
+        return torch.cat([places.flatten(1), cells.flatten(1)], 1)
 
 
 def channel_norm(grid: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from acwm_recurrent.agent_sight import AgentSight
-from acwm_recurrent.layers import Look
+from acwm_recurrent.layers import Overview
 from acwm_recurrent.nodes import (
     Form,
     NodeBlock,
@@ -23,7 +23,7 @@ from acwm_recurrent.nodes import (
 )
 from acwm_recurrent.poses import waves, waves_size
 
-POINTS, CELLS, HIDDEN, OCTAVES = 32, 4, 256, 3
+POINTS, HIDDEN, OCTAVES = 32, 256, 3
 
 ROUNDS = 3
 """How often it looks again where it thinks that things are."""
@@ -32,7 +32,7 @@ SPREAD = 4.0
 """Scale of the first guess, in units."""
 
 
-class NodeSight(Look):
+class NodeSight(Overview):
     """Guesses from the whole frame where things are, then looks there and corrects itself.
 
     So a snake finds a contour (Kass et al. 1988): what the picture shows at each node, and where
@@ -46,13 +46,11 @@ class NodeSight(Look):
     """
 
     def __init__(self, latent_channels: int, layout: NodeLayout, view: View, channels: int) -> None:
-        super().__init__(latent_channels, channels)
+        super().__init__(latent_channels, channels, POINTS)
         self.layout, self.view = layout, view
         axes, sides = layout.axes, len(layout.shape)
-        self.where = nn.Conv2d(channels, POINTS, 1)
-        self.what = nn.Conv2d(channels, 32, 1)
         self.guess = nn.Sequential(
-            nn.Linear(2 * POINTS + 32 * CELLS**2, HIDDEN),
+            nn.Linear(self.size, HIDDEN),
             nn.SiLU(),
             nn.Linear(HIDDEN, HIDDEN),
             nn.SiLU(),
@@ -70,23 +68,12 @@ class NodeSight(Look):
     def forward(self, frame: Tensor) -> list[Form]:
         """The forms that a latent frame `[B, C, h, w]` shows: the first guess to the last one."""
         grid = self.features(frame)
-        hidden = self.guess(self._summary(grid))
+        hidden = self.guess(self.summary(grid))
         agents = self.agents(frame, hidden)
         forms = [Form(agents, self._guessed(hidden, agents))]
         for _ in range(ROUNDS):
             forms.append(self._corrected(grid.float(), forms[-1]))
         return forms
-
-    def _summary(self, grid: Tensor) -> Tensor:
-        """Where things are, and what is seen in a few large cells, `[B, …]`."""
-        height, width = grid.shape[2:]
-        looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
-        rows, columns = (
-            torch.linspace(-1, 1, size, device=grid.device) for size in (height, width)
-        )
-        places = torch.cat([looks.sum(3) @ rows[:, None], looks.sum(2) @ columns[:, None]], 2)
-        cells = functional.adaptive_avg_pool2d(self.what(grid), CELLS)
-        return torch.cat([places.flatten(1), cells.flatten(1)], 1)
 
     def _guessed(self, hidden: Tensor, agents: Tensor) -> Tensor:
         """A first guess of the nodes, as they are seen from the agents where there are several."""

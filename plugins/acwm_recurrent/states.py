@@ -6,13 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_recurrent.layers import FrameDrawing, Look
+from acwm_recurrent.layers import CELLS, FrameDrawing, Overview
 
 POINTS = 48
 """Places in the picture that a state is read from, beside what the cells show."""
-
-CELLS = 4
-"""Cells per side to which a picture is pooled, and from which one is drawn."""
 
 HIDDEN = 256
 """Size of the hidden state that actions move, and of the hidden layers."""
@@ -24,11 +21,8 @@ STEP = 0.1
 """Scale of a change of states in a video frame, in standard deviations."""
 
 
-class StateSight(Look):
+class StateSight(Overview):
     """Reads the states that a latent frame shows.
-
-    By where things are, a softmax over the cells for each of `POINTS` (Finn et al. 2016, arXiv
-    1509.06113), and by what coarse cells show.
 
     Args:
         latent_channels: channels C of the latent.
@@ -37,11 +31,9 @@ class StateSight(Look):
     """
 
     def __init__(self, latent_channels: int, states: int, channels: int) -> None:
-        super().__init__(latent_channels, channels)
-        self.where = nn.Conv2d(channels, POINTS, 1)
-        self.what = nn.Conv2d(channels, 32, 1)
+        super().__init__(latent_channels, channels, POINTS)
         self.read = nn.Sequential(
-            nn.Linear(2 * POINTS + 32 * CELLS**2, HIDDEN),
+            nn.Linear(self.size, HIDDEN),
             nn.SiLU(),
             nn.Linear(HIDDEN, HIDDEN),
             nn.SiLU(),
@@ -50,15 +42,7 @@ class StateSight(Look):
 
     def forward(self, frame: Tensor) -> Tensor:
         """The states `[B, S]` in a latent frame `[B, C, h, w]`."""
-        grid = self.features(frame)
-        height, width = grid.shape[2:]
-        looks = self.where(grid).flatten(2).float().softmax(-1).unflatten(2, (height, width))
-        rows, columns = (
-            torch.linspace(-1, 1, size, device=frame.device) for size in (height, width)
-        )
-        places = torch.cat([looks.sum(3) @ rows[:, None], looks.sum(2) @ columns[:, None]], 2)
-        cells = functional.adaptive_avg_pool2d(self.what(grid), CELLS)
-        return self.read(torch.cat([places.flatten(1), cells.flatten(1)], 1)).float()
+        return self.read(self.summary(self.features(frame))).float()
 
 
 class StateMotion(nn.Module):

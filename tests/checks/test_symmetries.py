@@ -1,13 +1,14 @@
 """Symmetries: those that worlds declare hold in the simulator; groups act alike everywhere."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from acwm_core.checks.disc import Disc
 from acwm_core.checks.environment import EnvironmentChecks
+from acwm_core.checks.result import CheckFailure
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.symmetry import Symmetry, group
 from acwm_core.errors import ShapeError
@@ -34,6 +35,18 @@ def test_a_transformed_start_leads_to_the_transformed_video(world):
     suite = EnvironmentChecks(world)
     assert len(suite.card.symmetries) == DECLARED[world]
     suite.symmetries_hold()
+
+
+@pytest.mark.ci
+def test_where_a_world_is_chaotic_a_wrong_symmetry_is_still_refused():
+    cloth_move = pytest.importorskip("acwm_deformable.cloth_move").ClothMove
+    (mirror,) = cloth_move.card.symmetries
+
+    class Unmirrored(cloth_move):
+        card = replace(cloth_move.card, symmetries=(replace(mirror, actions=(1, 2, 3)),))
+
+    with pytest.raises(CheckFailure, match="state 'cloth_position' differs"):
+        EnvironmentChecks(Unmirrored).symmetries_hold()
 
 
 def test_a_group_is_closed_and_acts_alike_on_frames_and_on_the_plane():
