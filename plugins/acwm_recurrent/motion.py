@@ -22,6 +22,10 @@ NEAR, WIDE = 5, 3
 STEP = 0.3
 """Scale of a change: about as far as an agent gets in a frame, in units."""
 
+FASTEST = 1.0
+"""No body moves further along an axis in a frame, in units, and none turns further, in rad: in
+training a long window of a rare draw would grow without bounds."""
+
 
 class Moving(NamedTuple):
     """Poses in one video frame and how they change.
@@ -29,9 +33,11 @@ class Moving(NamedTuple):
     Attributes:
         poses: without the axis T.
         agent_change: of the agents' places since the frame before, `[B, A, 2]`.
-        hidden: `[B, A, HIDDEN]`.
+        hidden: of the agents, `[B, A, HIDDEN]`.
         place_change: of the bodies' places, `[B, N, 2]`.
         spin: change of the bodies' angles in rad, `[B, N, 1]`.
+        chance: numbers of each body that this draw of the future depends on, `[B, N, noise]`, of a
+            model that draws.
     """
 
     poses: Poses
@@ -39,6 +45,7 @@ class Moving(NamedTuple):
     hidden: Tensor
     place_change: Tensor
     spin: Tensor
+    chance: tuple[Tensor, ...] = ()
 
 
 class AgentMotion(nn.Module):
@@ -89,13 +96,15 @@ class BodyMotion(nn.Module):
     Args:
         channels: size of messages and of hidden layers.
         folds: see `Layout`.
+        noise: numbers of each body that what happens to it depends on, beside what is known.
     """
 
-    def __init__(self, channels: int, folds: int) -> None:
+    def __init__(self, channels: int, folds: int, noise: int = 0) -> None:
         super().__init__()
         self.folds = folds
         near = waves_size(2, NEAR)
         self.own = nn.Linear(13 + waves_size(2, WIDE), channels)
+        self.chance = nn.Linear(noise, channels, bias=False) if noise else None
         self.push = nn.Linear(2 * near + 2, channels)
         self.pushed = nn.Linear(channels, channels)
         self.pair = nn.Linear(near + 5, channels)
@@ -109,14 +118,9 @@ class BodyMotion(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(
-        self, poses: Poses, agents: Tensor, change: Tensor, spin: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Move the bodies by one frame, while agents move from `poses.agents` to `agents`.
-
-        Returns:
-            The new places and turns, and the changes of places and angles.
-        """
+    def forward(self, moving: Moving, agents: Tensor) -> Moving:
+        """Move the bodies by one frame, while the agents move to `agents`, `[B, A, 2]`."""
+        poses, change, spin = moving.poses, moving.place_change, moving.spin
         silu, places = functional.silu, poses.places
         sine, cosine = poses.turns[..., 1], poses.turns[..., 0]
         frame = direction(torch.atan2(sine, cosine) / self.folds)
@@ -136,6 +140,8 @@ class BodyMotion(nn.Module):
                 -1,
             )
         )
+        if self.chance:
+            own = own + self.chance(*moving.chance)
         pushes = self._pushes(poses, agents, frame, own)
         pairs = silu(self.pair(self._pairs(poses, frame, change, spin)) + own[:, :, None])
         others = 1 - torch.eye(places.shape[1], device=places.device)[:, :, None]
@@ -146,10 +152,16 @@ class BodyMotion(nn.Module):
             self.chain(pairs) + self.of_own(moved)[:, :, None] + self.of_other(moved)[:, None]
         )
         pulls = (silu(self.chained(pairs)) * heard).sum(2)
-        made = self.out(silu(self.last(torch.cat([moved, pulls], -1)))) * poses.present
+        made = self.out(silu(self.last(torch.cat([moved, pulls], -1))))
+        made = made.clamp(-FASTEST, FASTEST) * poses.present
         change, spin = turned(made[..., :2], frame), made[..., 2:]
         turns = turned(poses.turns, direction(self.folds * spin[..., 0]))
-        return places + change, turns, change, spin
+        return moving._replace(
+            poses=Poses(agents, poses.present, places + change, turns),
+            agent_change=agents - poses.agents,
+            place_change=change,
+            spin=spin,
+        )
 
     def _pushes(self, poses: Poses, agents: Tensor, frame: Tensor, own: Tensor) -> Tensor:
         """What the agents do to each body, `[B, N, channels]`."""

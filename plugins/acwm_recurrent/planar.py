@@ -21,13 +21,14 @@ from acwm_recurrent.poses import (
     direction,
     flattened,
     history,
+    joined,
     later,
     pose_at,
     stacked,
     turned_back,
 )
 from acwm_recurrent.scene import SceneModel
-from acwm_recurrent.sight import Sight, pose_loss, sight_loss
+from acwm_recurrent.sight import Sight, pose_distance, pose_loss, sight_loss
 from acwm_recurrent.windows import moving_windows
 
 READ_FRAMES = 4
@@ -78,6 +79,10 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         channels: size of all hidden layers.
         width: size of the conditioner's modulation.
         blocks: number of residual blocks that draw.
+        noise: numbers of each body that a draw depends on; 0 for a model that predicts one future.
+
+    Attributes:
+        noise: those of all bodies together.
 
     Raises:
         RecipeError: a size below 1, or states that are not these.
@@ -100,15 +105,19 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         channels: int = 96,
         width: int = 192,
         blocks: int = 4,
+        noise: int = 0,
     ) -> None:
         super().__init__(latent_channels, temporal_stride, width)
         if min(agents, bodies, folds, channels, width, blocks) < 1 or min(unit, view) <= 0:
-            raise RecipeError("all parameters of planar_bodies must be positive")
+            raise RecipeError("all parameters of planar_bodies but noise must be positive")
+        if noise < 0:
+            raise RecipeError(f"model.noise is {noise}; it must be at least 0")
+        self.noise, self.samples = bodies * noise, noise > 0
         self.layout = Layout(agents, bodies, folds, unit, state_size)
         self.view = view / unit
         self.sight = Sight(latent_channels, agents, bodies, channels)
         self.agent_motion = AgentMotion(agents, width, temporal_stride)
-        self.body_motion = BodyMotion(channels, folds)
+        self.body_motion = BodyMotion(channels, folds, noise)
         self.drawing = Drawing(
             latent_channels,
             agents,
@@ -128,6 +137,11 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         moving = self._begun(now, *(each / self.stride for each in self._changes(before, now)))
         past = [self._earlier(moving, number) for number in range(self.stride)]
         return Scene(base, self.drawing.canvas(base, stacked(past), cells), moving)
+
+    def fated(self, scene: Scene, draw: Tensor) -> Scene:
+        """The scene with the numbers of a draw; see `SceneModel.fated`."""
+        chance = draw.unflatten(1, (self.layout.bodies, -1))
+        return scene._replace(moving=scene.moving._replace(chance=(chance,)))
 
     def step(self, scene: Scene, told: Tensor) -> tuple[Scene, Poses]:
         """One latent frame later, and the poses in its video frames, `[B, stride, …]`."""
@@ -208,13 +222,14 @@ class PlanarBodies(SceneModel[Scene, Poses]):
 
     def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
         """The scene as tensors."""
-        poses, *changes = scene.moving
-        return (scene.base, scene.canvas, *poses, *changes)
+        poses, *changes, chance = scene.moving
+        return (scene.base, scene.canvas, *poses, *changes, *chance)
 
     def scene(self, state: tuple[Tensor, ...]) -> Scene:
         """The inverse of `tensors`."""
         base, canvas, *rest = state
-        return Scene(base, canvas, Moving(Poses(*rest[:4]), *rest[4:]))
+        moving = Moving(Poses(*rest[:4]), *rest[4:8], chance=tuple(rest[8:]))
+        return Scene(base, canvas, moving)
 
     def _agent_loss(
         self, true: Poses, conditioning: Conditioning, random: torch.Generator
@@ -235,19 +250,36 @@ class PlanarBodies(SceneModel[Scene, Poses]):
     def _body_loss(
         self, window: Poses, changes: tuple[Tensor, Tensor], random: torch.Generator
     ) -> Tensor:
-        """The error of the bodies in a window `[B, 1 + H, …]`, given how they moved before it."""
-        there = window.present
+        """The error of the bodies in a window `[B, 1 + H, …]`, given how they moved before it.
+
+        Of a model that draws, the energy score of two draws; see `EnergyScore`.
+        """
         poses = pose_at(window, 0)
         noise = sent(torch.randn(poses.places.shape, generator=random), poses.places)
-        poses = poses._replace(places=poses.places + START_NOISE * noise * there)
-        change, spin = changes
-        loss = poses.places.new_zeros(())
-        for number in range(1, window.places.shape[1]):
-            agents = window.agents[:, number]
-            places, turns, change, spin = self.body_motion(poses, agents, change, spin)
-            poses = Poses(agents, there, places, turns)
-            loss = loss + pose_loss(poses, pose_at(window, number))
-        return loss / (window.places.shape[1] - 1)
+        poses = poses._replace(places=poses.places + START_NOISE * noise * poses.present)
+        begun = self._begun(poses, torch.zeros_like(poses.agents), *changes)
+        path = window.agents[:, 1:]
+        true = joined(pose_at(window, frame) for frame in range(1, window.places.shape[1]))
+        if not self.samples:
+            return pose_loss(self._pushed(begun, path), true)
+        first, second = (
+            self._pushed(begun._replace(chance=(self._chance(poses, random),)), path)
+            for _ in range(2)
+        )
+        far = pose_distance(first, true) + pose_distance(second, true)
+        return (far - pose_distance(first, second)) / 2
+
+    def _chance(self, poses: Poses, random: torch.Generator) -> Tensor:
+        size = (*poses.places.shape[:2], self.noise // self.layout.bodies)
+        return sent(torch.randn(size, generator=random), poses.places)
+
+    def _pushed(self, moving: Moving, path: Tensor) -> Poses:
+        """The poses `[H B, …]` in all frames of the path `[B, H, A, 2]` of the agents."""
+        passed = list[Poses]()
+        for agents in path.unbind(1):
+            moving = self.body_motion(moving, agents)
+            passed.append(moving.poses)
+        return joined(passed)
 
     def _moved(self, moving: Moving, action: Tensor) -> Moving:
         """One video frame later."""
@@ -256,11 +288,7 @@ class PlanarBodies(SceneModel[Scene, Poses]):
             change, hidden = self.agent_motion(
                 action.float(), poses.agents, moving.agent_change, moving.hidden
             )
-            agents = poses.agents + change
-            places, turns, moved, spin = self.body_motion(
-                poses, agents, moving.place_change, moving.spin
-            )
-            return Moving(Poses(agents, poses.present, places, turns), change, hidden, moved, spin)
+            return self.body_motion(moving._replace(hidden=hidden), poses.agents + change)
 
     def _begun(self, poses: Poses, agents: Tensor, places: Tensor, spin: Tensor) -> Moving:
         hidden = poses.agents.new_zeros(*poses.agents.shape[:2], HIDDEN)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -128,6 +128,11 @@ def history(poses: Poses, last: Tensor, frames: int) -> Poses:
 def flattened(poses: Poses) -> Poses:
     """The first two axes as one."""
     return Poses(*(each.flatten(0, 1) for each in poses))
+
+
+def joined(batches: Iterable[Poses]) -> Poses:
+    """Several batches of poses as one."""
+    return Poses(*(torch.cat(each) for each in zip(*batches, strict=True)))
 
 
 def later(poses: Poses, first: int) -> Poses:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import LatentStream, Predictor
+from acwm_core.model.objectives.objective import drawn_noise, sent
 from acwm_core.model.shapes import Latent
 from acwm_recurrent.layers import MatrixConv
 
@@ -34,9 +36,11 @@ class SceneModel(Predictor, Generic[Scene, Course]):
 
     Attributes:
         name: by which a recipe knows it.
+        noise: numbers that a draw depends on, of one that draws futures (`samples`).
     """
 
     name: str
+    noise = 0
     layers, heads = 0, 1
     causal = streams = skips = follows_states = True
 
@@ -47,6 +51,10 @@ class SceneModel(Predictor, Generic[Scene, Course]):
     @abstractmethod
     def start(self, given: Latent) -> Scene:
         """What is known after the last of the given frames `[B, K, C, h, w]`."""
+
+    def fated(self, scene: Scene, draw: Tensor) -> Scene:
+        """The scene with the numbers `[B, noise]` of a draw, on which its future depends."""
+        raise NotImplementedError
 
     @abstractmethod
     def step(self, scene: Scene, told: Tensor) -> tuple[Scene, Any]:
@@ -93,6 +101,7 @@ class SceneModel(Predictor, Generic[Scene, Course]):
         *,
         only: Tensor | None = None,
         states: Tensor | None = None,
+        generators: Sequence[torch.Generator] = (),
     ) -> Latent:
         """Predict the latent frames after the given ones, `[B, L − K, C, h, w]`.
 
@@ -100,7 +109,7 @@ class SceneModel(Predictor, Generic[Scene, Course]):
         """
         known = given.shape[1]
         if states is None:
-            scene = self.start(given)
+            scene = self._started(given, self._draw(given, generators))
             course = self._followed(scene, conditioning, known, frames)
         else:
             scene, course = self.true_course(given, states)
@@ -109,17 +118,24 @@ class SceneModel(Predictor, Generic[Scene, Course]):
             numbers = numbers.gather(1, only)
         return self.drawn_course(scene, course, numbers)
 
-    def stream(self, given: Latent, *, context: int) -> LatentStream:
+    def stream(
+        self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()
+    ) -> LatentStream:
         """Stream from the scene. `context` is ignored, as the scene holds all that is known."""
-        return _SceneStream(self, given)
+        return _SceneStream(self, self._started(given, self._draw(given, generators)))
 
     def matrices(self) -> list[nn.Parameter]:
         """The weights of the convolutions in the blocks and in the head that draw."""
         return [each.weight for each in self.modules() if isinstance(each, MatrixConv)]
 
-    def initial_state(self, given: Latent, conditioning: Conditioning) -> tuple[Tensor, ...]:
-        """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors."""
-        return self.tensors(self.start(given))
+    def initial_state(
+        self, given: Latent, conditioning: Conditioning, *draw: Tensor
+    ) -> tuple[Tensor, ...]:
+        """The first state of a stream that begins with latents `[B, K, C, h, w]`, as tensors.
+
+        `draw` is the noise of a model that draws, `[B, noise]`.
+        """
+        return self.tensors(self._started(given, draw))
 
     def next_state(
         self, state: tuple[Tensor, ...], conditioning: Conditioning
@@ -151,6 +167,14 @@ class SceneModel(Predictor, Generic[Scene, Course]):
             )
         return given
 
+    def _draw(self, given: Latent, generators: Sequence[torch.Generator]) -> tuple[Tensor, ...]:
+        """A draw of one of the futures, `[B, noise]`."""
+        return (sent(drawn_noise((self.noise,), generators), given),) if self.samples else ()
+
+    def _started(self, given: Latent, draw: tuple[Tensor, ...]) -> Scene:
+        scene = self.start(given)
+        return self.fated(scene, *draw) if self.samples else scene
+
     def _followed(
         self, scene: Scene, conditioning: Conditioning, known: int, frames: int
     ) -> Course:
@@ -164,8 +188,8 @@ class SceneModel(Predictor, Generic[Scene, Course]):
 class _SceneStream(LatentStream):
     """A stream that carries the scene."""
 
-    def __init__(self, model: SceneModel[Any, Any], given: Latent) -> None:
-        self._model, self._state = model, model.tensors(model.start(given))
+    def __init__(self, model: SceneModel[Any, Any], scene: Any) -> None:
+        self._model, self._state = model, model.tensors(scene)
 
     def advance(self, conditioning: Conditioning) -> Latent:
         """The next latent frame; see `LatentStream.advance`."""

@@ -8,6 +8,9 @@ from torch.nn import functional
 from acwm_recurrent.layers import Look
 from acwm_recurrent.poses import Poses
 
+LEAST = 0.02
+"""Distance, in units, below which a pose counts as nearly right in `pose_distance`."""
+
 
 class Sight(Look):
     """Finds every agent and body by where it looks: a softmax over the cells, one for each thing.
@@ -62,3 +65,16 @@ def pose_loss(made: Poses, true: Poses) -> Tensor:
     places = functional.smooth_l1_loss(made.places, true.places, beta=0.05, reduction="none")
     turns = functional.smooth_l1_loss(made.turns, true.turns, beta=0.1, reduction="none")
     return ((places + 0.2 * turns) * true.present).sum() / true.present.sum().clamp(min=1)
+
+
+def pose_distance(first: Poses, second: Poses) -> Tensor:
+    """The mean distance of the poses of the bodies that are there, a scalar.
+
+    Of each body a multiquadric of place and turn together, which is as good for an energy score as
+    the Euclidean norm and has a gradient at zero.
+    """
+    places = (first.places - second.places).square().sum(-1)
+    turns = (0.2 * (first.turns - second.turns)).square().sum(-1)
+    there = second.present[..., 0]
+    distance = (places + turns + LEAST**2).sqrt() - LEAST
+    return (distance * there).sum() / there.sum().clamp(min=1)

@@ -113,7 +113,7 @@ def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
 @pytest.mark.parametrize(
     "model",
     [
-        {"name": "planar_bodies", "bodies": 2},
+        {"name": "planar_bodies", "bodies": 2, "noise": 3},
         {"name": "drawn_states", "state_size": 4, "following": 2},
         {"name": "flexible_body", "nodes": [9]},
     ],

@@ -7,11 +7,13 @@ import pytest
 import torch
 from torch.nn import functional
 
+from acwm_core.checks import check_model
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_recurrent.motion import BodyMotion
+from acwm_core.model.objectives.regression import Regression
+from acwm_recurrent.motion import HIDDEN, BodyMotion, Moving
 from acwm_recurrent.planar import PlanarBodies
-from acwm_recurrent.poses import Layout, Poses, direction, turned, turned_back
+from acwm_recurrent.poses import Layout, Poses, direction, pose_at, turned, turned_back
 from acwm_recurrent.windows import HORIZONS, moving_windows
 from tests.recurrent.dots import world_of
 
@@ -20,10 +22,10 @@ REACH = 1.0
 """Distance in units below which an agent pushes a puck."""
 
 
-def pucks(clips, seed, frames=17, bodies=2):
+def pucks(clips, seed, frames=17, bodies=2, reach=REACH):
     """Agents that go where they are told, and pucks that they push straight away; as states.
 
-    A push leaves a puck at the distance `REACH` behind which it was met, so that all that happens
+    A push leaves a puck at the distance `reach` behind which it was met, so that all that happens
     follows from simple geometry.
     """
     random = np.random.default_rng(seed)
@@ -37,8 +39,8 @@ def pucks(clips, seed, frames=17, bodies=2):
         agent[:, now] = agent[:, now - 1] + 0.3 * (goal - agent[:, now - 1])
         apart = place[:, now - 1] - agent[:, now, None]
         far = np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-6)
-        pushed = agent[:, now, None] + apart / far * REACH
-        place[:, now] = np.where(far < REACH, pushed, place[:, now - 1])
+        pushed = agent[:, now, None] + apart / far * reach
+        place[:, now] = np.where(far < reach, pushed, place[:, now - 1])
     present = np.ones((clips, frames, bodies))
     angles = np.zeros((clips, frames, bodies))
     parts = [agent, present, place.reshape(clips, frames, -1), angles]
@@ -88,8 +90,9 @@ def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():
             turned(here, turn),
             direction(4 * (angles + by)),
         )
-        change = motion(poses, turned(torch.tensor([[[1.2, 0.9]]]), turn), *still)[2]
-        return turned_back(change, turn)
+        moving = Moving(poses, torch.zeros(1, 1, 2), torch.zeros(1, 1, HIDDEN), *still)
+        moved = motion(moving, turned(torch.tensor([[[1.2, 0.9]]]), turn))
+        return turned_back(moved.place_change, turn)
 
     first = moved(0.0)
     assert first[0, :2].abs().min() > 0
@@ -98,20 +101,25 @@ def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():
     torch.testing.assert_close(first, moved(0.0, third=3.0))
 
 
-def test_it_learns_how_agents_push_bodies():
-    """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
-    model = model_of_pucks(channels=48)
+def taught(model, states, actions):
+    """A world model that has learned motion for two hundred steps."""
     world = world_of(model, stride=1, states=10)
     optimizer = torch.optim.AdamW(world.parameters(), 3e-3)
     random = torch.Generator().manual_seed(0)
-    states, actions = pucks(256, seed=0)
     for step in range(200):
-        rows = torch.randint(256, (64,), generator=random)
+        rows = torch.randint(len(states), (64,), generator=random)
         optimizer.zero_grad()
         loss = world.motion_loss(actions[rows], states[rows], random, progress=step / 200)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(world.parameters(), 0.5)
         optimizer.step()
+    return world
+
+
+def test_it_learns_how_agents_push_bodies():
+    """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
+    model = model_of_pucks(channels=48)
+    world = taught(model, *pucks(256, seed=0))
     states, actions = pucks(64, seed=1)
     with torch.no_grad():
         told = model.agent_motion.told(
@@ -132,6 +140,43 @@ def test_it_learns_how_agents_push_bodies():
     error = (moving.poses.places - true.places[:, -1]).norm(dim=-1)
     assert moved.mean() > 0.3
     assert error.mean() < 0.6 * moved.mean()
+
+
+def test_it_draws_what_cannot_be_known():
+    """Pushes reach as far as chance has it: draws differ where pucks do, and as much."""
+    reaches = np.random.default_rng(5)
+    model = model_of_pucks(channels=48, noise=2)
+    taught(model, *pucks(256, seed=0, reach=reaches.uniform(0.5, 1.5, (256, 2, 1))))
+    chances = [reaches.uniform(0.5, 1.5, (32, 2, 1)) for _ in range(16)]
+    truths = [model.layout.poses(pucks(32, seed=1, reach=each)[0]) for each in chances]
+    start, path = pose_at(truths[0], 0), truths[0].agents[:, 1:]
+    still = torch.zeros(32, 1, 2), torch.zeros(32, 2, 2), torch.zeros(32, 2, 1)
+    begun, random = model._begun(start, *still), torch.Generator().manual_seed(0)
+
+    def drawn():
+        made = model._pushed(begun._replace(chance=(model._chance(start, random),)), path)
+        return made.places.unflatten(0, (16, 32))[-1]
+
+    with torch.no_grad():
+        draws = torch.stack([drawn() for _ in truths])
+    true = torch.stack([each.places[:, -1] for each in truths])
+    doubt, spread = (each.var(0).sum(-1).sqrt() for each in (true, draws))
+    assert doubt.mean() > 0.2
+    assert 0.7 < spread[doubt > 0.1].mean() / doubt[doubt > 0.1].mean() < 1.4
+    assert spread[doubt < 0.01].mean() < 0.3 * spread[doubt > 0.1].mean()
+    one, mean = ((each - true).norm(dim=-1).mean() for each in (draws, draws.mean(0)))
+    assert mean < one
+
+
+def test_one_that_draws_conforms_and_learns_pictures_by_squared_error():
+    def drawing(*, latent_channels):
+        return PlanarBodies(latent_channels=latent_channels, noise=2, **SMALL)
+
+    results = [*check_model(drawing)]
+    assert [each.name for each in results if not each.passed] == []
+    tried = {each.name for each in results if not each.reason}
+    assert {"draws from the generators if it says so", "streams what it predicts"} <= tried
+    Regression().check_model(drawing(latent_channels=3))
 
 
 def test_windows_are_of_what_moves():

@@ -19,7 +19,8 @@ from acwm_core.model.shapes import Latent
 class Regression(Objective[Predictor]):
     """Mean squared error of the predicted latents, with gradients through the whole clip.
 
-    A model therefore predicts means: what cannot be known becomes blurred.
+    A model therefore predicts means: what cannot be known becomes blurred. Only one that draws its
+    pictures from states (`Predictor.follows_states`), which are true ones here, may draw futures.
 
     Args:
         state_weight: weight of the model's loss of the agent's states, if it learns some.
@@ -43,7 +44,8 @@ class Regression(Objective[Predictor]):
     def check_model(self, model: DynamicsModel) -> None:
         """Refuse a model that cannot learn by it, or not all that it could; see `Objective`."""
         super().check_model(model)
-        if model.samples and not self.draws:
+        follows = isinstance(model, Predictor) and model.follows_states
+        if model.samples and not self.draws and not follows:
             raise RecipeError(
                 f"{type(self).__name__} teaches the mean of all futures, but "
                 f"{type(model).__name__} draws one: set objective=energy_score, or model.noise=0"
