@@ -107,4 +107,4 @@ def test_the_decoder_learns_from_the_models_that_predict_its_latents():
     shipped = (ROOT / "plugins" / "acwm_zoo" / "models").glob("*/recipe.yaml")
     codecs = {path.parent.name: yaml.safe_load(path.read_text())["codec"] for path in shipped}
     fitting = {name for name, codec in codecs.items() if codec["name"].startswith("compact")}
-    assert {*named} == fitting - {"push_cube_128"}
+    assert {*named} == fitting - {"push_cube_128", "push_cube_draws"}  # drawn as push_cube is
