@@ -18,10 +18,10 @@ from acwm_recurrent.poses import (
     Layout,
     Poses,
     angle_between,
+    concatenated,
     direction,
     flattened,
     history,
-    joined,
     later,
     pose_at,
     stacked,
@@ -138,8 +138,8 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         past = [self._earlier(moving, number) for number in range(self.stride)]
         return Scene(base, self.drawing.canvas(base, stacked(past), cells), moving)
 
-    def fated(self, scene: Scene, draw: Tensor) -> Scene:
-        """The scene with the numbers of a draw; see `SceneModel.fated`."""
+    def with_draw(self, scene: Scene, draw: Tensor) -> Scene:
+        """The scene with the numbers of a draw; see `SceneModel.with_draw`."""
         chance = draw.unflatten(1, (self.layout.bodies, -1))
         return scene._replace(moving=scene.moving._replace(chance=(chance,)))
 
@@ -259,7 +259,7 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         poses = poses._replace(places=poses.places + START_NOISE * noise * poses.present)
         begun = self._begun(poses, torch.zeros_like(poses.agents), *changes)
         path = window.agents[:, 1:]
-        true = joined(pose_at(window, frame) for frame in range(1, window.places.shape[1]))
+        true = concatenated(pose_at(window, frame) for frame in range(1, window.places.shape[1]))
         if not self.samples:
             return pose_loss(self._pushed(begun, path), true)
         first, second = (
@@ -279,7 +279,7 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         for agents in path.unbind(1):
             moving = self.body_motion(moving, agents)
             passed.append(moving.poses)
-        return joined(passed)
+        return concatenated(passed)
 
     def _moved(self, moving: Moving, action: Tensor) -> Moving:
         """One video frame later."""

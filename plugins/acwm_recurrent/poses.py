@@ -130,7 +130,7 @@ def flattened(poses: Poses) -> Poses:
     return Poses(*(each.flatten(0, 1) for each in poses))
 
 
-def joined(batches: Iterable[Poses]) -> Poses:
+def concatenated(batches: Iterable[Poses]) -> Poses:
     """Several batches of poses as one."""
     return Poses(*(torch.cat(each) for each in zip(*batches, strict=True)))
 

@@ -52,7 +52,7 @@ class SceneModel(Predictor, Generic[Scene, Course]):
     def start(self, given: Latent) -> Scene:
         """What is known after the last of the given frames `[B, K, C, h, w]`."""
 
-    def fated(self, scene: Scene, draw: Tensor) -> Scene:
+    def with_draw(self, scene: Scene, draw: Tensor) -> Scene:
         """The scene with the numbers `[B, noise]` of a draw, on which its future depends."""
         raise NotImplementedError
 
@@ -173,7 +173,7 @@ class SceneModel(Predictor, Generic[Scene, Course]):
 
     def _started(self, given: Latent, draw: tuple[Tensor, ...]) -> Scene:
         scene = self.start(given)
-        return self.fated(scene, *draw) if self.samples else scene
+        return self.with_draw(scene, *draw) if self.samples else scene
 
     def _followed(
         self, scene: Scene, conditioning: Conditioning, known: int, frames: int
