@@ -17,12 +17,15 @@ from acwm_recurrent.node_drawing import NodeDrawing
 from acwm_recurrent.node_motion import NodeMotion
 from acwm_recurrent.node_sight import NodeSight, form_loss
 from acwm_recurrent.node_windows import node_windows
-from acwm_recurrent.nodes import Form, NodeLayout, View
+from acwm_recurrent.nodes import Form, NodeLayout, View, spacing, unstretched
 from acwm_recurrent.scene import SceneModel
 from acwm_recurrent.states import StateMotion
 
 READ_FRAMES = 3
 """Frames of each clip from which it learns to read forms, the first one among them."""
+
+FOUND = 0.2
+"""Weight of the cross entropy of where agents are found."""
 
 AGENT = 0.3
 """What a unit of the agents' places counts where they are moved."""
@@ -47,6 +50,7 @@ class Scene(NamedTuple):
         form: in the last video frame.
         hidden: what moves the agents, see `StateMotion`.
         change: of the nodes in the last video frame, `[B, N, D]`.
+        spacing: how far apart neighbours are in the given frame, `[B]`.
     """
 
     base: Tensor
@@ -55,6 +59,7 @@ class Scene(NamedTuple):
     form: Form
     hidden: Tensor
     change: Tensor
+    spacing: Tensor
 
 
 class FlexibleBody(SceneModel[Scene, Form]):
@@ -82,13 +87,16 @@ class FlexibleBody(SceneModel[Scene, Form]):
         fov: its vertical field of view, degrees.
         light: direction to the light that casts shadows on the ground z = 0, if they are to be
             drawn.
+        stretch: share by which neighbouring nodes may get further apart than in the given frame;
+            None if nothing keeps them together.
         channels: size of the layers that look and draw.
         motion_channels: size of the layers that move nodes.
         width: size of the conditioner's modulation.
         blocks: number of residual blocks that draw.
 
     Raises:
-        RecipeError: a size below 1, or states, a camera or a light that are not these.
+        RecipeError: a size below 1, a negative stretch, or states, a camera or a light that are
+            not these.
     """
 
     name = "flexible_body"
@@ -108,6 +116,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
         target: Sequence[float] = (0.0, -0.08, 0.0),
         fov: float = 33.5,
         light: Sequence[float] | None = None,
+        stretch: float | None = None,
         channels: int = 96,
         motion_channels: int = 64,
         width: int = 192,
@@ -116,9 +125,12 @@ class FlexibleBody(SceneModel[Scene, Form]):
         super().__init__(latent_channels, temporal_stride, width)
         if min(channels, motion_channels, width, blocks) < 1:
             raise RecipeError("all sizes of flexible_body must be at least 1")
+        if stretch is not None and not stretch >= 0:
+            raise RecipeError(f"model.stretch is {stretch}; it must be 0 or more, or null")
+        self.stretch = stretch
         self.layout = layout = NodeLayout(agents, nodes, every, unit, state_size)
         view = View(eye, target, fov, unit)
-        self.sight = NodeSight(latent_channels, layout, view, channels)
+        self.sight = NodeSight(latent_channels, layout, view, light, channels)
         self.agent_motion = StateMotion(agents * layout.axes, 0, width, temporal_stride)
         self.node_motion = NodeMotion(layout, motion_channels)
         self.drawing = NodeDrawing(
@@ -135,7 +147,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
     def start(self, given: Latent) -> Scene:
         """What is known after the last of the given frames; see `SceneModel.start`."""
         base = self.checked(given)[:, -1]
-        return self._begun(base, self.sight(base)[-1])
+        return self._begun(base, self.sight(base))
 
     def step(self, scene: Scene, told: Tensor) -> tuple[Scene, Form]:
         """One latent frame later, and the forms in its video frames, `[B, stride, …]`."""
@@ -144,6 +156,10 @@ class FlexibleBody(SceneModel[Scene, Form]):
             for action in told.unbind(1):
                 agents, hidden = self._followed_by(form.agents, action, hidden)
                 nodes, change = self.node_motion(form, agents, change)
+                if self.stretch is not None:
+                    longest = (1 + self.stretch) * scene.spacing
+                    nodes = unstretched(nodes, self.layout.shape, longest)
+                    change = nodes - form.nodes
                 form = Form(agents, nodes)
                 passed.insert(0, form)
         scene = scene._replace(form=form, hidden=hidden, change=change)
@@ -161,10 +177,10 @@ class FlexibleBody(SceneModel[Scene, Form]):
         looked = batch.latents.take_along_dim(read[..., None, None, None], 1).flatten(0, 1)
         rows = torch.arange(len(read), device=read.device)[:, None]
         shown = Form(*(each[rows, self.stride * read].flatten(0, 1) for each in true))
-        forms = self.sight(looked)
+        forms, found = self.sight.look(looked)
         shown = shown.reversed(self._turned_round(forms[-1], shown))
         loss = torch.stack([form_loss(each, shown).mean() for each in forms]).mean()
-        loss = loss + self.sight.agents.stray(looked, shown.agents)
+        loss = loss + FOUND * self.sight.agents.loss(found, shown.agents, looked.shape[2:])
         if not self.node_motion.out.weight.requires_grad:
             return loss
         random = batch.generators[0]
@@ -201,7 +217,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
         base, now = given[:, -1], (given.shape[1] - 1) * self.stride
         true = self.layout.form(states[:, now:])
         with torch.no_grad():
-            read = self.sight(base)[-1]
+            read = self.sight(base)
             true = true.reversed(self._turned_round(read, true.at(0)))
             if self.training:
                 off = [mine - real[:, 0] for mine, real in zip(read, true, strict=True)]
@@ -233,19 +249,20 @@ class FlexibleBody(SceneModel[Scene, Form]):
 
     def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
         """The scene as tensors."""
-        return (scene.base, scene.canvas, scene.looks, *scene.form, scene.hidden, scene.change)
+        return (*scene[:3], *scene.form, *scene[4:])
 
     def scene(self, state: tuple[Tensor, ...]) -> Scene:
         """The inverse of `tensors`."""
-        base, canvas, looks, agents, nodes, hidden, change = state
-        return Scene(base, canvas, looks, Form(agents, nodes), hidden, change)
+        base, canvas, looks, agents, nodes, *others = state
+        return Scene(base, canvas, looks, Form(agents, nodes), *others)
 
     def _begun(self, base: Tensor, form: Form) -> Scene:
         with torch.autocast(base.device.type, enabled=False):
             hidden = self.agent_motion.begin(AGENT * form.agents.flatten(1))
         still = Form(*(each[:, None].expand(-1, self.stride, -1, -1) for each in form))
         canvas, looks = self.drawing.canvas(base, still)
-        return Scene(base, canvas, looks, form, hidden, torch.zeros_like(form.nodes))
+        apart = spacing(form.nodes, self.layout.shape)
+        return Scene(base, canvas, looks, form, hidden, torch.zeros_like(form.nodes), apart)
 
     def _followed_by(self, agents: Tensor, action: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """The agents' places a video frame later, and what moves them."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_recurrent.agent_sight import AgentSight
+from acwm_recurrent.agent_sight import AgentSight, Found
+from acwm_recurrent.ground_look import GroundLook
 from acwm_recurrent.layers import Overview
 from acwm_recurrent.nodes import (
     Form,
@@ -28,6 +30,9 @@ POINTS, HIDDEN, OCTAVES = 32, 256, 3
 ROUNDS = 3
 """How often it looks again where it thinks that things are."""
 
+HELD = 5.6
+"""What is held is read as if the first two agents were so many units apart."""
+
 SPREAD = 4.0
 """Scale of the first guess, in units."""
 
@@ -35,17 +40,26 @@ SPREAD = 4.0
 class NodeSight(Overview):
     """Guesses from the whole frame where things are, then looks there and corrects itself.
 
-    So a snake finds a contour (Kass et al. 1988): what the picture shows at each node, and where
-    its neighbours are, tell where it should move. The nodes of a rope are kept at equal distances.
+    So a snake finds a contour (Kass et al. 1988): what the picture shows at each node, on the
+    ground below it and where its shadow would fall, and where its neighbours are, tell where it
+    should move. The nodes of a rope are kept at equal distances.
 
     Args:
         latent_channels: channels C of the latent.
         layout: of the nodes.
         view: the camera.
+        light: direction to the light that casts shadows on the ground, if there is one.
         channels: channels of its convolutions.
     """
 
-    def __init__(self, latent_channels: int, layout: NodeLayout, view: View, channels: int) -> None:
+    def __init__(
+        self,
+        latent_channels: int,
+        layout: NodeLayout,
+        view: View,
+        light: Sequence[float] | None,
+        channels: int,
+    ) -> None:
         super().__init__(latent_channels, channels, POINTS)
         self.layout, self.view = layout, view
         axes, sides = layout.axes, len(layout.shape)
@@ -56,51 +70,76 @@ class NodeSight(Overview):
             nn.SiLU(),
         )
         self.guess_nodes = nn.Linear(HIDDEN, math.prod(layout.shape) * axes)
-        self.agents = AgentSight(latent_channels, layout, view, HIDDEN)
+        self.agents = AgentSight(latent_channels, layout, view, light)
+        self.ground = GroundLook(view, light) if axes == 3 else None
+        seen = channels * (1 + (self.ground.looks if self.ground else 0))
         place = waves_size(axes, OCTAVES)
         self.agent = nn.Sequential(
-            nn.Linear(channels + place, channels), nn.SiLU(), nn.Linear(channels, axes)
+            nn.Linear(seen + place, channels), nn.SiLU(), nn.Linear(channels, axes)
         )
-        self.tell = nn.Linear(channels + place + 2 * sides * axes, channels)
+        self.tell = nn.Linear(seen + place + 2 * sides * axes, channels)
         self.blocks = nn.ModuleList(NodeBlock(sides, channels, each) for each in (1, 2, 4))
         self.shift = nn.Linear(channels, axes)
 
-    def forward(self, frame: Tensor) -> list[Form]:
-        """The forms that a latent frame `[B, C, h, w]` shows: the first guess to the last one."""
+    def forward(self, frame: Tensor) -> Form:
+        """The form that a latent frame `[B, C, h, w]` shows."""
+        return self.look(frame)[0][-1]
+
+    def look(self, frame: Tensor) -> tuple[list[Form], Found]:
+        """The forms from the first guess to the last one, and how the agents were found."""
         grid = self.features(frame)
         hidden = self.guess(self.summary(grid))
-        agents = self.agents(frame, hidden)
-        forms = [Form(agents, self._guessed(hidden, agents))]
+        found = self.agents(frame)
+        forms = [Form(found.places, self._guessed(hidden, found.places))]
         for _ in range(ROUNDS):
             forms.append(self._corrected(grid.float(), forms[-1]))
-        return forms
+        return forms, found
 
     def _guessed(self, hidden: Tensor, agents: Tensor) -> Tensor:
         """A first guess of the nodes, as they are seen from the agents where there are several."""
-        nodes = SPREAD * self.guess_nodes(hidden).float().unflatten(1, (-1, self.layout.axes))
-        if agents.shape[1] > 1:
-            agents = agents.detach()  # they are not learned by what hangs from them
-            back = ahead_of(agents) * agents.new_tensor([1.0, -1.0])
-            nodes = agents.mean(1, keepdim=True) + seen_from(back, nodes)
-        return self._evenly(nodes)
+        nodes = self.guess_nodes(hidden).float().unflatten(1, (-1, self.layout.axes))
+        if agents.shape[1] == 1:
+            return self._evenly(SPREAD * nodes)
+        agents = agents.detach()  # they are not learned by what hangs from them
+        back = ahead_of(agents) * agents.new_tensor([1.0, -1.0])
+        nodes = HELD * self._size(agents) * nodes
+        return agents.mean(1, keepdim=True) + seen_from(back, nodes)
 
     def _corrected(self, grid: Tensor, form: Form) -> Form:
         agents, nodes = (each.detach() for each in form)  # where it looks is not learned by looking
         seen, shown = self._seen(grid, agents), self._seen(grid, nodes)
-        shift = self.agent(torch.cat([seen, waves(agents / 2, OCTAVES)], -1))
-        sides = along_sides(nodes, self.layout.shape)
-        features = self.tell(torch.cat([shown, waves(nodes / 2, OCTAVES), sides], -1))
+        held, there = (self._held(agents, each) for each in (agents, nodes))
+        shift = self.agent(torch.cat([seen, waves(held / 2, OCTAVES)], -1))
+        size, sides = self._size(agents), along_sides(nodes, self.layout.shape)
+        told = [shown, waves(there / size / 2, OCTAVES), sides / size]
+        features = self.tell(torch.cat(told, -1))
         for block in self.blocks:
             features = block(features, self.layout.shape)
-        moved = form.nodes + self.shift(functional.silu(features)).float()
+        moved = form.nodes + size * self.shift(functional.silu(features)).float()
         return Form(form.agents + shift.float(), self._evenly(moved))
+
+    def _size(self, agents: Tensor) -> Tensor:
+        """Scale of what is held, `[B, 1, 1]`: a larger cloth is a smaller one, seen from nearer."""
+        if agents.shape[1] == 1:
+            return agents.new_ones(len(agents), 1, 1)
+        return (agents[:, 1:2] - agents[:, :1]).norm(dim=-1, keepdim=True) / HELD
+
+    def _held(self, agents: Tensor, places: Tensor) -> Tensor:
+        """Places as its corrections hear of them: as seen from the agents, where there are several.
+
+        So what hangs from them is read alike wherever it hangs.
+        """
+        if agents.shape[1] == 1:
+            return places
+        return seen_from(ahead_of(agents), places - agents.mean(1, keepdim=True))
 
     def _evenly(self, nodes: Tensor) -> Tensor:
         return evenly(nodes) if len(self.layout.shape) == 1 else nodes
 
     def _seen(self, grid: Tensor, places: Tensor) -> Tensor:
         """What the frame shows at places `[B, N, D]`: `[B, N, channels]`."""
-        return seen_at(grid, self.view(places, grid.shape[3] / grid.shape[2])[..., :2])
+        seen = seen_at(grid, self.view(places, grid.shape[3] / grid.shape[2])[..., :2])
+        return seen if self.ground is None else torch.cat([seen, self.ground(grid, places)], 2)
 
 
 def form_loss(made: Form, true: Form) -> Tensor:

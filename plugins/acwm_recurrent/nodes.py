@@ -15,6 +15,9 @@ from acwm_recurrent.poses import turned_back
 EVEN = 2
 """How often nodes are put at equal distances; each time the line gets a little shorter."""
 
+PULLS, PULL = 4, 0.25
+"""How often neighbours that are too far apart pull at each other; the share of the excess."""
+
 HORIZON = 1e-2
 """How far below the horizon the ground is seen at least, in units a unit away."""
 
@@ -228,6 +231,29 @@ def evenly(nodes: Tensor) -> Tensor:
         step = step[..., None].expand(-1, -1, nodes.shape[2])
         nodes = nodes[:, :-1].gather(1, step) + part[..., None] * steps.gather(1, step)
     return nodes
+
+
+def spacing(nodes: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """How far apart neighbours are along the side of a rope or cloth that is straightest, `[B]`."""
+    grid = nodes.unflatten(1, shape)
+    sides = [grid.diff(dim=side + 1).norm(dim=-1).flatten(1).mean(1) for side in range(len(shape))]
+    return torch.stack(sides).amax(0)
+
+
+def unstretched(nodes: Tensor, shape: tuple[int, ...], longest: Tensor) -> Tensor:
+    """Nodes `[B, N, D]`, with neighbours pulled together that are further apart than `longest`.
+
+    Position based dynamics (Müller et al. 2007), all neighbours at a time.
+    """
+    grid, longest = nodes.unflatten(1, shape), longest.view(-1, *[1] * (len(shape) + 1))
+    for _ in range(PULLS):
+        for side in range(1, len(shape) + 1):
+            apart = grid.diff(dim=side)
+            far = apart.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+            pull = PULL * (1 - longest / far).clamp(min=0) * apart
+            none = torch.zeros_like(pull.narrow(side, 0, 1))
+            grid = grid + torch.cat([pull, none], side) - torch.cat([none, pull], side)
+    return grid.flatten(1, len(shape))
 
 
 class NodeBlock(nn.Module):

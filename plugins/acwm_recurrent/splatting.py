@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_core.errors import RecipeError
+from acwm_recurrent.ground_look import light_of, shadows_of
 from acwm_recurrent.nodes import Form, NodeLayout, View
 
 FINE = 4
@@ -57,12 +57,8 @@ class Splatting(nn.Module):
         values: int,
     ) -> None:
         super().__init__()
-        if light is not None and (layout.axes != 3 or len(light) != 3 or light[2] <= 0):
-            raise RecipeError(
-                "model.light is the direction [x, y, z] to a light above the ground, for nodes "
-                f"with x, y and z, and not {list(light)}"
-            )
-        self.shape, self.view, self.light = layout.shape, view, light
+        self.shape, self.view = layout.shape, view
+        self.light = None if light is None else light_of(light, layout.axes)
         self.points = tuple((side - 1) * POINTS + 1 for side in layout.shape)
         self.texture = nn.Parameter(0.3 * torch.randn(TEXTURE, *self.points))
         shown = values + TEXTURE + KNOWN + (KNOWN if light else 0)
@@ -84,9 +80,8 @@ class Splatting(nn.Module):
         frames = form.nodes.shape[1]
         points = self._between(form.nodes.flatten(0, 1)).unflatten(0, (-1, frames))
         heard = [self._splatted(torch.cat([points, form.agents], 2), told, size)]
-        if self.light:
-            light = points.new_tensor(self.light)
-            fallen = points - points[..., 2:] / light[2] * light
+        if self.light is not None:
+            fallen = shadows_of(points, self.light.to(points))
             heard.append(self._splatted(fallen, told[:, : fallen.shape[2], :0], size))
         return torch.cat(heard, 2)
 

@@ -9,12 +9,12 @@ import torch
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
 from acwm_recurrent import node_windows as node_windows_module
-from acwm_recurrent.agent_sight import AgentSight
+from acwm_recurrent.agent_sight import AgentSight, cell_places
 from acwm_recurrent.flexible import FlexibleBody
 from acwm_recurrent.node_motion import NodeMotion
-from acwm_recurrent.node_sight import NodeSight, form_loss
+from acwm_recurrent.node_sight import HIDDEN, NodeSight, form_loss
 from acwm_recurrent.node_windows import node_windows
-from acwm_recurrent.nodes import Form, NodeLayout, View, evenly
+from acwm_recurrent.nodes import Form, NodeLayout, View, evenly, spacing, unstretched
 from acwm_sim.camera import Camera
 from tests.recurrent.dots import world_of
 
@@ -109,11 +109,37 @@ def test_nodes_are_put_at_equal_distances_along_their_line():
     assert steps.std() < 1e-3 * steps.mean()
 
 
+def test_a_line_that_was_pulled_apart_is_as_long_as_it_was_again():
+    """Its middle stays where it is, as nodes pull at each other alike."""
+    line = torch.zeros(2, 9, 3)
+    line[..., 0] = torch.linspace(0, 1, 9) ** 2 * torch.tensor([[8.0], [12.0]])
+    made, apart = line, torch.tensor([1.0, 1.5])
+    for _ in range(100):
+        made = unstretched(made, (9,), apart)
+    far = made.diff(dim=1).norm(dim=-1)
+    assert (far <= 1.001 * apart[:, None]).all()
+    torch.testing.assert_close(made.mean(1), line.mean(1))
+    torch.testing.assert_close(unstretched(made, (9,), 2 * apart), made)  # what is slack is left
+
+
+def test_a_cloth_is_as_far_apart_as_along_its_straight_side():
+    """Its rows hang through, so that the ends of each are nearer together."""
+    down, across = torch.meshgrid(torch.arange(4.0), torch.arange(5.0), indexing="ij")
+    nodes = torch.stack([0.8 * across, torch.zeros_like(down), -down], -1).flatten(0, 1)[None]
+    apart = spacing(nodes, (4, 5))
+    torch.testing.assert_close(apart, torch.ones(1))
+    torch.testing.assert_close(unstretched(nodes, (4, 5), apart), nodes)
+    pulled = nodes * torch.tensor([1.0, 1.0, 1.5])
+    for _ in range(100):
+        pulled = unstretched(pulled, (4, 5), apart)
+    assert (pulled.unflatten(1, (4, 5)).diff(dim=1).norm(dim=-1) <= 1.001).all()
+
+
 def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
     """In all of the training the first agent is on the left."""
     torch.manual_seed(0)
     layout, view = NodeLayout(2, [3], 1, 1.0, 2 * 5), View(EYE, TARGET, FOV, 1.0)
-    sight = AgentSight(2, layout, view, 4)
+    sight = AgentSight(2, layout, view, None)
     optimizer = torch.optim.AdamW(sight.parameters(), 1e-2)
 
     def pictures(left):
@@ -127,16 +153,80 @@ def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
         return frames, view.on_ground(middles, 1.0)
 
     def missed(frames, true):
-        return (sight(frames, torch.zeros(32, 4)) - true).norm(dim=-1).mean()
+        return (sight(frames).places - true).norm(dim=-1).mean()
 
     for _ in range(60):
         frames, true = pictures(left=0)
         optimizer.zero_grad()
-        (missed(frames, true) + sight.stray(frames, true)).backward()
+        found = sight(frames)
+        error = (found.places - true).norm(dim=-1).mean()
+        (error + sight.loss(found, true, frames.shape[2:])).backward()
         optimizer.step()
     with torch.no_grad():
         assert missed(*pictures(left=0)) < 0.2
         assert missed(*pictures(left=1)) < 0.2
+
+
+def test_a_shadow_tells_how_far_away_an_agent_is():
+    """In all of the training it is on the left; mirrored frames are lit from the other side."""
+    torch.manual_seed(0)
+    light = torch.tensor([0.8, -0.5, 1.0])
+    layout, view = NodeLayout(1, [3], 1, 1.0, 3 * 4), View(EYE, TARGET, FOV, 1.0)
+    sight = AgentSight(2, layout, view, light.tolist())
+    optimizer = torch.optim.AdamW(sight.parameters(), 5e-3)
+    cells = cell_places(torch.Size([16, 16]), torch.device("cpu"))
+
+    def pictures(low, high):
+        share = torch.rand(48, 1, 3)
+        true = share * torch.tensor([high - low, 3.0, 1.6]) + torch.tensor([low, -1.5, 0.2])
+        fallen = true - true[..., 2:] / light[2] * light
+        seen = [view(each, 1.0)[..., :2] for each in (true, fallen)]
+        spots = [torch.exp(-60 * (each - cells).square().sum(-1)) for each in seen]
+        return torch.stack(spots, 1).unflatten(2, (16, 16)), true
+
+    def missed(frames, true):
+        return (sight(frames).places - true).norm(dim=-1).mean()
+
+    for step in range(150):
+        frames, true = pictures(-2.0, 0.0)
+        if step % 2:
+            frames, true = frames.flip(3), true * torch.tensor([-1.0, 1.0, 1.0])
+        optimizer.zero_grad()
+        found = sight(frames)
+        error = (found.places - true).norm(dim=-1).mean()
+        (error + sight.loss(found, true, frames.shape[2:])).backward()
+        optimizer.step()
+    with torch.no_grad():
+        frames, true = pictures(0.0, 2.0)
+        assert missed(frames, true) < 0.2
+        lightless = frames * torch.tensor([1.0, 0.0])[:, None, None]
+        assert missed(lightless, true) > 0.4
+
+
+def test_agents_hear_of_each_other_how_high_they_would_be():
+    """Nothing tells how far away the first one is, but that it is as high as the second."""
+    layout, view = NodeLayout(2, [3], 1, 1.0, 3 * 5), View(EYE, TARGET, FOV, 1.0)
+    sight = AgentSight(2, layout, view, None)
+    places = torch.randn(1, 2, 20, 3, generator=torch.Generator().manual_seed(0))
+    fits = torch.zeros(1, 2, 20)
+    fits[0, 1, 7] = 30.0
+    heard = sight._heard(lambda told: -50 * told[..., :1].square(), fits, places)
+    heights = places[0, ..., 2]
+    assert heard[0, 0].argmax() == (heights[0] - heights[1, 7]).abs().argmin()
+    assert heard[0, 1].std() < heard[0, 0].std()
+
+
+def test_what_hangs_is_guessed_alike_however_its_agents_stand():
+    torch.manual_seed(0)
+    layout, view = NodeLayout(2, [3, 3], 1, 1.0, 3 * 11), View(EYE, TARGET, FOV, 1.0)
+    sight, hidden = NodeSight(2, layout, view, None, 8), torch.randn(1, HIDDEN)
+    agents = torch.tensor([[[-1.0, 0.0, 2.0], [1.0, 0.0, 2.0]]])
+    apart = sight._guessed(hidden, agents) - agents.mean(1, keepdim=True)
+    turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    others = 2 * agents @ turn
+    turned = sight._guessed(hidden, others) - others.mean(1, keepdim=True)
+    torch.testing.assert_close(turned, 2 * apart @ turn)
+    assert apart.std() > 0.1
 
 
 def test_mixed_precision_moves_no_place_in_the_picture():
@@ -218,7 +308,7 @@ def test_it_finds_a_line_in_a_picture_from_either_end():
     torch.manual_seed(0)
     layout = NodeLayout(1, [NODES], 1, 1.0, 2 + 2 * NODES)
     view = View(EYE, TARGET, FOV, 1.0)
-    sight = NodeSight(2, layout, view, 24)
+    sight = NodeSight(2, layout, view, None, 24)
     optimizer = torch.optim.AdamW(sight.parameters(), 3e-3)
     sides = (torch.arange(12) + 0.5) / 6 - 1
     cells = torch.stack(torch.meshgrid(sides, sides, indexing="xy"), -1).flatten(0, 1)
@@ -238,11 +328,11 @@ def test_it_finds_a_line_in_a_picture_from_either_end():
     for step in range(120):
         frames, true = pictures(64, step)
         optimizer.zero_grad()
-        torch.stack(missed(sight(frames), true)).mean().backward()
+        torch.stack(missed(sight.look(frames)[0], true)).mean().backward()
         optimizer.step()
     frames, true = pictures(64, 1000)
     with torch.no_grad():
-        first, *_, last = missed(sight(frames), true)
+        first, *_, last = missed(sight.look(frames)[0], true)
     assert last.mean() < 0.25
     assert last.mean() < first.mean()
 
@@ -272,7 +362,7 @@ def test_it_learns_to_draw_nodes_as_wrong_as_it_reads_them_and_in_its_order():
     backwards = Form(true.agents, true.nodes.flip(-2))
     with torch.no_grad():
         course = model.train().true_course(given, states)[1]
-        read = model.sight(given[:, 0])[-1]
+        read = model.sight(given[:, 0])
     for clip in range(8):
         off = [
             (course.nodes[clip] - each.nodes[clip] - (read.nodes[clip] - each.nodes[clip, 0]))
