@@ -116,10 +116,9 @@ class AgentSight(nn.Module):
         """
         seen = self.view(true, size[1] / size[0])
         inside = (seen[..., :2].abs() <= 1).all(-1)
-        away = (cell_places(size, true.device) - seen[:, :, None, :2]) * (
-            seen.new_tensor([size[1] / 2, size[0] / 2])
-        )
-        loss = (_missed(found.cells, away.norm(dim=-1)) * inside).mean()
+        away = cell_places(size, true.device) - seen[:, :, None, :2]
+        cells_away = (away * away.new_tensor([size[1] / 2, size[0] / 2])).norm(dim=-1)
+        loss = (_missed(found.cells, cells_away) * inside).mean()
         if self.axes == 2:
             return loss
         far = seen[..., 2:] - self.view.eye.norm() - self.tried
@@ -154,9 +153,8 @@ class AgentSight(nn.Module):
         """
         apart = places[:, :, None, :, None] - places[:, None, :, None]
         relative = torch.stack([apart[..., 2], apart[..., :2].norm(dim=-1)], -1)
-        heard = (pair(waves(relative, OCTAVES)).float()[..., 0] + fits[:, None, :, None]).logsumexp(
-            -1
-        )
+        agreed = pair(waves(relative, OCTAVES)).float()[..., 0]
+        heard = (agreed + fits[:, None, :, None]).logsumexp(-1)
         others = 1 - torch.eye(fits.shape[1], device=fits.device)
         return (heard * others[..., None]).sum(2)
 

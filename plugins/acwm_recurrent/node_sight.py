@@ -33,6 +33,9 @@ ROUNDS = 3
 HELD = 5.6
 """What is held is read as if the first two agents were so many units apart."""
 
+LEAST = 0.5
+"""How many units apart they are at least, so that nothing is divided by 0."""
+
 SPREAD = 4.0
 """Scale of the first guess, in units."""
 
@@ -122,7 +125,8 @@ class NodeSight(Overview):
         """Scale of what is held, `[B, 1, 1]`: a larger cloth is a smaller one, seen from nearer."""
         if agents.shape[1] == 1:
             return agents.new_ones(len(agents), 1, 1)
-        return (agents[:, 1:2] - agents[:, :1]).norm(dim=-1, keepdim=True) / HELD
+        apart = (agents[:, 1:2] - agents[:, :1]).norm(dim=-1, keepdim=True)
+        return apart.clamp(min=LEAST) / HELD
 
     def _held(self, agents: Tensor, places: Tensor) -> Tensor:
         """Places as its corrections hear of them: as seen from the agents, where there are several.
