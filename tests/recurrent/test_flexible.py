@@ -135,6 +135,21 @@ def test_a_cloth_is_as_far_apart_as_along_its_straight_side():
     assert (pulled.unflatten(1, (4, 5)).diff(dim=1).norm(dim=-1) <= 1.001).all()
 
 
+def missed(sight, frames, true):
+    """How far off a sight finds agents."""
+    with torch.no_grad():
+        return (sight(frames).places - true).norm(dim=-1).mean()
+
+
+def learn_to_find(sight, optimizer, frames, true):
+    """One step of training of a sight of agents."""
+    optimizer.zero_grad()
+    found = sight(frames)
+    error = (found.places - true).norm(dim=-1).mean()
+    (error + sight.loss(found, true, frames.shape[2:])).backward()
+    optimizer.step()
+
+
 def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
     """In all of the training the first agent is on the left."""
     torch.manual_seed(0)
@@ -152,23 +167,14 @@ def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
         middles = (torch.stack([columns, rows], -1) + 0.5) / 8 - 1
         return frames, view.on_ground(middles, 1.0)
 
-    def missed(frames, true):
-        return (sight(frames).places - true).norm(dim=-1).mean()
-
     for _ in range(60):
-        frames, true = pictures(left=0)
-        optimizer.zero_grad()
-        found = sight(frames)
-        error = (found.places - true).norm(dim=-1).mean()
-        (error + sight.loss(found, true, frames.shape[2:])).backward()
-        optimizer.step()
-    with torch.no_grad():
-        assert missed(*pictures(left=0)) < 0.2
-        assert missed(*pictures(left=1)) < 0.2
+        learn_to_find(sight, optimizer, *pictures(left=0))
+    assert missed(sight, *pictures(left=0)) < 0.2
+    assert missed(sight, *pictures(left=1)) < 0.2
 
 
 def test_a_shadow_tells_how_far_away_an_agent_is():
-    """In all of the training it is on the left; mirrored frames are lit from the other side."""
+    """On the right, training shows it in mirrored frames alone, lit from the other side."""
     torch.manual_seed(0)
     light = torch.tensor([0.8, -0.5, 1.0])
     layout, view = NodeLayout(1, [3], 1, 1.0, 3 * 4), View(EYE, TARGET, FOV, 1.0)
@@ -184,23 +190,15 @@ def test_a_shadow_tells_how_far_away_an_agent_is():
         spots = [torch.exp(-60 * (each - cells).square().sum(-1)) for each in seen]
         return torch.stack(spots, 1).unflatten(2, (16, 16)), true
 
-    def missed(frames, true):
-        return (sight(frames).places - true).norm(dim=-1).mean()
-
     for step in range(150):
         frames, true = pictures(-2.0, 0.0)
         if step % 2:
             frames, true = frames.flip(3), true * torch.tensor([-1.0, 1.0, 1.0])
-        optimizer.zero_grad()
-        found = sight(frames)
-        error = (found.places - true).norm(dim=-1).mean()
-        (error + sight.loss(found, true, frames.shape[2:])).backward()
-        optimizer.step()
-    with torch.no_grad():
-        frames, true = pictures(0.0, 2.0)
-        assert missed(frames, true) < 0.2
-        lightless = frames * torch.tensor([1.0, 0.0])[:, None, None]
-        assert missed(lightless, true) > 0.4
+        learn_to_find(sight, optimizer, frames, true)
+    frames, true = pictures(0.0, 2.0)
+    assert missed(sight, frames, true) < 0.2
+    lightless = frames * torch.tensor([1.0, 0.0])[:, None, None]
+    assert missed(sight, lightless, true) > 0.4
 
 
 def test_agents_hear_of_each_other_how_high_they_would_be():
