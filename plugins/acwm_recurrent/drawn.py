@@ -25,6 +25,9 @@ HORIZONS = ((0.35, 8), (0.65, 20))
 """Until which share of the training motion is learned from windows of so many video frames: the
 same error in a tenth of the time. Then from whole clips, in which errors add up."""
 
+MOVED_FRAMES = 128 * 64
+"""Most video frames that a step of motion moves, of all its clips: of long ones it takes fewer."""
+
 SHOWN_NOISE = 0.02
 """Noise on the true states that drawing is learned from, beside the error of reading."""
 
@@ -202,7 +205,8 @@ class DrawnStates(SceneModel[Scene, Tensor]):
     ) -> Tensor:
         """The error in so many video frames after the first, from a start that is a little off."""
         with torch.autocast(true.device.type, enabled=False):
-            told = self.told_of(conditioning)[:, self.stride + first :]
+            true, noise = (each[: max(1, MOVED_FRAMES // frames)] for each in (true, noise))
+            told = self.told_of(conditioning)[: len(true), self.stride + first :]
             states, passed = true[:, first] + START_NOISE * noise, list[Tensor]()
             hidden = self.motion.begin(states)
             for action in told[:, :frames].unbind(1):

@@ -63,6 +63,22 @@ def test_it_learns_how_actions_move_states(following):
     assert (scene.states - states[:, -1]).abs().mean() < 0.25 * moved
 
 
+def test_of_long_clips_a_step_moves_fewer(monkeypatch):
+    """A step costs no more than it did, however long episodes are."""
+    world = world_of(model_of_arms(), stride=1, states=4)
+    states, actions = arms(8, seed=0)
+
+    def loss(clips):
+        random = torch.Generator().manual_seed(0)
+        return world.motion_loss(actions[:clips], states[:clips], random, progress=1)
+
+    monkeypatch.setattr("acwm_recurrent.drawn.START_NOISE", 0.0)
+    few = loss(3)
+    assert abs(loss(8) - few) > 1e-3
+    monkeypatch.setattr("acwm_recurrent.drawn.MOVED_FRAMES", 3 * (FRAMES - 1))
+    torch.testing.assert_close(loss(8), few)
+
+
 def test_it_reads_what_a_picture_shows():
     """A dot in a channel of its own for each of two places; the states are where they are."""
     torch.manual_seed(0)
