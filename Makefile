@@ -58,7 +58,7 @@ CODEC_OPTIONS ?= --steps 16000 --batch 16 --peak 8e-4
 DECODER_DATA := cloth_move:256 push_sand:88 pour_water:96 stack_cube:256 push_rope:256 push_cube:256 \
   robot_arm:256 reacher:256
 # The models that ship and predict its latents; of other worlds it learns from true ones.
-DECODER_MODELS := push_sand pour_water push_cube
+DECODER_MODELS := push_sand push_cube
 DECODER := $(CODEC_FOLDER)/compact_reference.safetensors
 DECODER_OPTIONS ?= --batch 24 --peak 5e-4
 

@@ -21,7 +21,7 @@ READ_FRAMES = 2
 START_NOISE = 0.03
 """Noise on the true states that motion is learned from, in standard deviations."""
 
-HORIZONS = ((0.35, 8), (0.65, 20))
+HORIZONS = ((0.35, 8), (0.65, 20), (0.9, 64))
 """Until which share of the training motion is learned from windows of so many video frames: the
 same error in a tenth of the time. Then from whole clips, in which errors add up."""
 

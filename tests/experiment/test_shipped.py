@@ -39,7 +39,7 @@ def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
     assert len(made.runs) == 8
     kinds = {"push_cube": "planar_bodies"}
     kinds |= dict.fromkeys(("push_rope", "cloth_move"), "flexible_body")
-    kinds |= dict.fromkeys(("robot_arm", "stack_cube", "reacher"), "drawn_states")
+    kinds |= dict.fromkeys(("robot_arm", "stack_cube", "reacher", "pour_water"), "drawn_states")
     for run in made.runs:
         assert run.recipe.model.name == kinds.get(run.dataset.environment, "recurrent")
         assert str(run.dataset.path) == f"data/{run.dataset.environment}_zoo"

@@ -45,11 +45,11 @@ def test_it_says_how_it_was_made_and_how_good_it_is(name):
 
 
 def test_a_training_can_go_on_from_it_as_the_docs_say():
-    recipe = compose("pour_water", ["+small", "+recurrent", "model.channels=96"])
-    card = DatasetCard.read(RunFolder(folder("pour_water")).card)
+    recipe = compose("push_sand", ["+small", "+recurrent", "model.channels=96"])
+    card = DatasetCard.read(RunFolder(folder("push_sand")).card)
     world_model = build_world_model(recipe, card.environment)
-    load_weights(world_model, RunFolder(folder("pour_water")).weights)
-    theirs = acwm.load("pour_water").world_model.model.state_dict()
+    load_weights(world_model, RunFolder(folder("push_sand")).weights)
+    theirs = acwm.load("push_sand").world_model.model.state_dict()
     own = world_model.model.state_dict()
     assert own.keys() == theirs.keys()
     assert all(torch.equal(value, theirs[name]) for name, value in own.items())
