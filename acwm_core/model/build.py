@@ -46,19 +46,19 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
     card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
     objective = build_objective(recipe.objective)
-    states = state_size(recipe.data.get("states", ()), card)
-    model = build_model(recipe.model, objective, codec.channels, states, codec.temporal_stride)
+    states = state_shapes(recipe.data.get("states", ()), card)
+    size = sum(math.prod(shape) for shape in states.values())
+    model = build_model(recipe.model, objective, codec.channels, size, codec.temporal_stride)
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
     bounds = card.action.low, card.action.high
     clips = {name: recipe.data[name] for name in ("clip_frames", "context_frames")}
-    clips["state_size"] = states
-    return WorldModel(codec, model, conditioner, objective, *bounds, **clips)
+    return WorldModel(codec, model, conditioner, objective, *bounds, **clips, state_shapes=states)
 
 
-def state_size(names: Sequence[str], card: EnvironmentCard) -> int:
-    """Number of values of some fields of the state.
+def state_shapes(names: Sequence[str], card: EnvironmentCard) -> dict[str, tuple[int, ...]]:
+    """Shapes of some fields of the state, by name, in this order.
 
     Raises:
         RecipeError: there is no such field.
@@ -68,7 +68,7 @@ def state_size(names: Sequence[str], card: EnvironmentCard) -> int:
         if name not in shapes:
             known = ", ".join(shapes) or "none at all"
             raise RecipeError(f"data.states: {card.name} has no state {name!r}, but {known}")
-    return sum(math.prod(shapes[name]) for name in names)
+    return {name: tuple(shapes[name]) for name in names}
 
 
 def build_codec(choice: ComponentConfig) -> Codec:

@@ -140,9 +140,9 @@ class Denoiser(DynamicsModel):
 class Predictor(DynamicsModel):
     """A network that computes the frames after the given ones at once, without noise to remove.
 
-    One that draws a future (`samples`) takes the further keyword ``generators`` in `forward` and in
-    `stream`: one CPU generator per clip, its only source of randomness. Its stream draws as
-    `forward` does, so that the future stays the same one.
+    One that draws a future (`samples`) takes the further keyword ``generators`` in `forward`, in
+    `stream` and in `predict_states`: one CPU generator per clip, its only source of randomness. All
+    draw alike, so that the future stays the same one.
 
     One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
     which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
@@ -156,17 +156,22 @@ class Predictor(DynamicsModel):
     ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
     return, counted from the first predicted one.
 
+    One that knows how the scene's states go on (`predicts_states`) tells them in `predict_states`,
+    without drawing a picture.
+
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
         skips: whether `forward` takes ``only``.
         follows_states: whether `forward` takes ``states``, and all are of every video frame.
         raw_states: whether it takes states as they were recorded, and not scaled to variance 1.
+        predicts_states: whether it implements `predict_states`.
     """
 
     streams: bool = False
     skips: bool = False
     follows_states: bool = False
     raw_states: bool = False
+    predicts_states: bool = False
 
     @abstractmethod
     def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
@@ -204,6 +209,19 @@ class Predictor(DynamicsModel):
             f"{type(self).__name__} learns no motion without pictures: leave out "
             "training.agent_steps"
         )
+
+    def predict_states(self, given: Latent, conditioning: Conditioning, frames: int) -> Tensor:
+        """The states in each video frame after the given ones, `[B, T, S]`. Optional.
+
+        In the units in which they were recorded; NaN where it knows none.
+
+        Args:
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`, or `[1, K, C, h, w]` if all
+                clips begin alike.
+            conditioning: the embedded actions of B clips.
+            frames: length L of the clips, including the given frames.
+        """
+        raise RecipeError(f"{type(self).__name__} predicts no states")
 
     def stream(self, given: Latent, *, context: int) -> LatentStream:
         """Predict one latent frame at a time, without end. Optional, for causal models.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -38,7 +39,7 @@ class WorldModel(nn.Module):
         action_high: upper bounds; both are used to normalise actions to [-1, 1].
         clip_frames: number of frames of a training clip.
         context_frames: number of given first frames of a clip; they must be whole latent frames.
-        state_size: number of values of the agent's state that the model learns too.
+        state_shapes: shapes of the fields of the state that the model learns too, in its order.
 
     Raises:
         RecipeError: `context_frames` are no whole latent frames, or leave nothing to predict.
@@ -60,7 +61,7 @@ class WorldModel(nn.Module):
         *,
         clip_frames: int = CLIP_FRAMES,
         context_frames: int = 1,
-        state_size: int = 0,
+        state_shapes: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         super().__init__()
         stride = codec.temporal_stride
@@ -74,6 +75,8 @@ class WorldModel(nn.Module):
         self.model, self.conditioner, self.objective = model, conditioner, objective
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
+        self.state_shapes = {name: tuple(shape) for name, shape in (state_shapes or {}).items()}
+        state_size = sum(math.prod(shape) for shape in self.state_shapes.values())
         # Needed in training only: `TrainingModule` sets them.
         self.register_buffer("state_mean", torch.zeros(state_size), persistent=False)
         self.register_buffer("state_std", torch.ones(state_size), persistent=False)

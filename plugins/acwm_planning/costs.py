@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import RecipeError, noting
 from acwm_core.recipe.trust import import_named
 from acwm_planning.planner import Cost, Futures
+from acwm_planning.predicted import NotPredicted
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:
@@ -43,7 +47,11 @@ class LatentDistance(Cost):
 
 
 class StateDistance(Cost):
-    """The task's own distance, from states that the environment's estimator reads from frames.
+    """The task's own distance, from states that the model predicts or that are read from frames.
+
+    A model that knows how the states go on is asked for them, and need not draw a picture. Of
+    others, and if the task looks at more than the model predicts, the environment's estimator reads
+    the predicted frames.
 
     The mean over the frames in which the distance can be read, and a penalty for the others.
     Objects fade from a prediction when the model is unsure of them: without the penalty, a search
@@ -52,25 +60,49 @@ class StateDistance(Cost):
 
     Args:
         frames: number of latent frames to judge, evenly spaced and including the last; null for
-            all. Decoding and reading them takes most of the time.
+            all. If pictures are read, that takes most of the time.
+        read: "model" or "pictures", the only source of states; null for the model's own where they
+            are enough.
         failure: added to the cost if the task fails in one of these frames, in tolerances of the
             task.
         unknown: penalty in tolerances of the task, times the share of frames whose distance cannot
             be read.
+
+    Raises:
+        RecipeError: a source that is not one of these; `read="model"` of one that does not predict
+            what the task looks at.
     """
 
     def __init__(
-        self, *, frames: int | None = 3, failure: float = 10.0, unknown: float = 10.0
+        self,
+        *,
+        frames: int | None = 3,
+        read: Literal["model", "pictures"] | None = None,
+        failure: float = 10.0,
+        unknown: float = 10.0,
     ) -> None:
-        self.frames, self.failure, self.unknown = frames, failure, unknown
+        if read not in ("model", "pictures", None):
+            raise RecipeError(f"cost.read is {read!r}: give model, pictures or null")
+        self.frames, self.read, self.failure, self.unknown = frames, read, failure, unknown
         last_frames(1, frames)
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """See `Cost`. The unit is the task's tolerance."""
         frames = last_frames(futures.length, self.frames)
-        seen = futures.observe(frames)
-        distances = judged(task, "distance", seen, goal).reshape(-1, len(frames)) / task.tolerance
-        failed = judged(task, "failed", seen, goal).reshape(-1, len(frames)).any(1)
+        predicted = None if self.read == "pictures" else futures.predicted(frames)
+        if predicted is not None:
+            try:
+                return self._judge(predicted, len(frames), task, goal)
+            except NotPredicted:
+                if self.read == "model":
+                    raise
+        elif self.read == "model":
+            raise RecipeError("the model predicts no states: set cost.read=pictures")
+        return self._judge(futures.observe(frames), len(frames), task, goal)
+
+    def _judge(self, seen: Observation, frames: int, task: Task, goal: Goal) -> Tensor:
+        distances = judged(task, "distance", seen, goal).reshape(-1, frames) / task.tolerance
+        failed = judged(task, "failed", seen, goal).reshape(-1, frames).any(1)
         known = np.isfinite(distances)
         total = np.where(known, distances, 0).sum(1)
         mean = total / np.maximum(known.sum(1), 1)

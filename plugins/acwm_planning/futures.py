@@ -1,10 +1,13 @@
-"""A world model's predictions for candidates. Only the frames that a cost looks at are decoded."""
+"""A world model's predictions for candidates.
+
+Only the frames that a cost looks at are decoded, and predicted if the model saves the work.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -18,11 +21,13 @@ from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
+from acwm_core.model.dynamics import Predictor
 from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.planner import Cost, Futures, RolloutCost
+from acwm_planning.predicted import predicted_observation
 
 
 @dataclass
@@ -67,34 +72,52 @@ class ModelFutures(Futures):
 
     Args:
         codec: codec of the latents, which knows the current frame.
-        latents: predicted latents after `before`, `[N, L, C, h, w]`.
-        before: the latent frames up to now, `[N, K, C, h, w]`.
+        given: the latent frames that the prediction begins with, `[N, K, C, h, w]`.
+        past: number of latent frames between them and the plan; the last of them is numbered -1.
+        length: number of planned latent frames.
+        predict: predicts the latent frames of these numbers, `[N, len(frames), C, h, w]`.
         last: index, within the last latent frame, of the last planned video frame.
         estimator: reads states from frames, if there is one.
         stills: pictures and their latent frames, encoded before; shared within a decision.
+        states: of the planned video frames, `[N, T, S]`, if the model predicts them.
+        shapes: shapes of their fields.
     """
 
     def __init__(
         self,
         codec: Codec,
-        latents: Latent,
-        before: Latent,
+        given: Latent,
+        past: int,
+        length: int,
+        predict: Callable[[Sequence[int]], Latent],
         last: int,
         estimator: StateEstimator | None,
         stills: list[tuple[Frame, Latent]],
+        states: Callable[[], Tensor] | None = None,
+        shapes: Mapping[str, tuple[int, ...]] | None = None,
     ) -> None:
-        self._codec, self._latents, self._before = codec, latents, before
+        self._codec, self._given, self._past, self._predict = codec, given, past, predict
         self._last, self._estimator, self._stills = last, estimator, stills
-        self.length = latents.shape[1]
+        self.length = length
+        self._states, self._shapes = states, shapes or {}
+        self._predicted: dict[int, Latent] = {}
+        self._told: Tensor | None = None
 
     @property
     def finite(self) -> Tensor:
-        """Which candidates have a finite prediction, `[N]`."""
-        return self._latents.detach().isfinite().flatten(1).all(1)
+        """Which candidates' predictions are finite, `[N]`, in what was asked for."""
+        if self._told is not None and not self._predicted:
+            return _finite_states(self._told)
+        self.latents([self.length - 1])
+        seen = torch.stack(list(self._predicted.values()), 1)
+        return seen.detach().isfinite().flatten(1).all(1)
 
     def latents(self, frames: Sequence[int]) -> Latent:
-        """They carry a gradient if the predicted latents do."""
-        return self._latents[:, list(frames)]
+        """They carry a gradient if the predicted latents do. Each is predicted once."""
+        missing = [frame for frame in frames if frame not in self._predicted]
+        if missing:
+            self._predicted.update(zip(missing, self._predict(missing).unbind(1), strict=True))
+        return torch.stack([self._predicted[frame] for frame in frames], 1)
 
     @torch.no_grad()
     def video(self, frames: Sequence[int]) -> Video:
@@ -102,22 +125,27 @@ class ModelFutures(Futures):
 
         On a CPU that has it, in bfloat16: decoding takes most of a decision, and is twice as fast.
         """
-        device = self._latents.device.type
+        device = self._given.device.type
         fast = device == "cpu" and cpu_has_fast_bfloat16()
         with torch.autocast(device, torch.bfloat16, enabled=fast):
             return self._decode(list(frames)).float()
 
     def _decode(self, chosen: list[int]) -> Video:
         stride = self._codec.temporal_stride
-        places = [self._last if frame == self.length - 1 else stride - 1 for frame in chosen]
+        places = [self._place(frame) for frame in chosen]
         if self._codec.memoryless:
             decode, starts = self._codec.frame_decoder(), range(0, stride * len(chosen), stride)
-            decode(self._before[:1, :1])  # the first latent frame of a video is special
-            video = decode(self._latents[:, chosen])
+            decode(self._given[:1, :1])  # the first latent frame of a video is special
+            video = decode(self.latents(chosen))
         else:
-            video = self._codec.decode(torch.cat([self._before, self._latents], 1))
+            later = self.latents(range(-self._past, self.length))
+            video = self._codec.decode(torch.cat([self._given, later], 1))
             starts = [video.shape[1] - stride * (self.length - frame) for frame in chosen]
         return video[:, [start + place for start, place in zip(starts, places, strict=True)]]
+
+    def _place(self, frame: int) -> int:
+        """Index of a latent frame's last planned video frame within it."""
+        return self._last if frame == self.length - 1 else self._codec.temporal_stride - 1
 
     def observe(self, frames: Sequence[int]) -> Observation:
         """The estimator reads the decoded frames.
@@ -132,14 +160,31 @@ class ModelFutures(Futures):
             )
         return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 
+    def predicted(self, frames: Sequence[int]) -> Observation | None:
+        """The states of the last video frame of each latent frame, which are predicted once."""
+        if self._states is None:
+            return None
+        if self._told is None:
+            self._told = self._states()
+        stride = self._codec.temporal_stride
+        places = [frame * stride + self._place(frame) for frame in frames]
+        return predicted_observation(self._told[:, places].flatten(0, 1).cpu(), self._shapes)
+
     def still(self, picture: Frame) -> Latent:
         """Each picture is encoded once per decision."""
         for known, latent in self._stills:
             if known is picture:
                 return latent
-        latent = still_latent(self._codec, picture, self._latents.device)
+        latent = still_latent(self._codec, picture, self._given.device)
         self._stills.append((picture, latent))
         return latent
+
+
+def _finite_states(states: Tensor) -> Tensor:
+    """For which clips, `[N]`, states `[N, T, S]` are finite that the model knows of any of them."""
+    finite = states.isfinite()
+    known = finite.any(1).any(0)
+    return finite[..., known].flatten(1).all(1) & known.any()
 
 
 class _Given(NamedTuple):
@@ -206,7 +251,7 @@ class ModelRollouts:
             for part in actions.split(self._batch):
                 futures = self._futures(given, part, seed, stills)
                 # An estimator may read something from a picture that is not finite.
-                finite, readable = futures.finite.cpu(), goal_cost(futures, len(part)).cpu()
+                readable, finite = goal_cost(futures, len(part)).cpu(), futures.finite.cpu()
                 costs.append(torch.where(finite, readable, torch.nan))
             return torch.cat(costs)
 
@@ -243,16 +288,48 @@ class ModelRollouts:
         seed: int,
         stills: list[tuple[Frame, Latent]],
     ) -> ModelFutures:
-        with torch.set_grad_enabled(actions.requires_grad):
-            latents = self._predict(given, actions, seed)
-        codec = given.codec
-        now = codec.latent_frames(given.frames)
-        last = (actions.shape[1] - 1) % codec.temporal_stride
-        before, after = latents[:, :now], latents[:, now:]
-        return ModelFutures(codec, after, before, last, self._estimator, stills)
+        codec, stride, known = given.codec, given.codec.temporal_stride, given.latents.shape[1]
+        past = codec.latent_frames(given.frames) - known
+        length, last = -(-actions.shape[1] // stride), (actions.shape[1] - 1) % stride
 
-    def _predict(self, given: _Given, actions: Actions, seed: int) -> Latent:
-        """All latent frames, including the given ones, `[N, L, C, h, w]`."""
+        def predict(frames: Sequence[int]) -> Latent:
+            numbers = [known + past + frame for frame in frames]
+            with torch.set_grad_enabled(actions.requires_grad):
+                return self._predict(given, actions, seed, numbers)
+
+        def states() -> Tensor:
+            return self._predict_states(given, actions, seed)[:, past * stride :]
+
+        latents = given.latents.expand(len(actions), -1, -1, -1, -1)
+        world = self.world_model
+        mine = isinstance(world.model, Predictor) and world.model.predicts_states
+        told = (states if mine else None), world.state_shapes
+        futures = ModelFutures(
+            codec, latents, past, length, predict, last, self._estimator, stills, *told
+        )
+        if not (isinstance(world.model, Predictor) and world.model.skips):
+            futures.latents(range(-past, length))  # all at once
+        return futures
+
+    def _predict(
+        self, given: _Given, actions: Actions, seed: int, only: Sequence[int] | None = None
+    ) -> Latent:
+        """All latent frames, including the given ones, `[N, L, C, h, w]`; or only these."""
+        world, (begin, length) = self.world_model, self._begun(given, actions, seed)
+        if only is None:
+            return world.objective.predict(world.model, begin, length, self._steps)
+        return world.objective.predict_frames(world.model, begin, length, only, self._steps)
+
+    @torch.no_grad()
+    def _predict_states(self, given: _Given, actions: Actions, seed: int) -> Tensor:
+        """The states in all video frames after the given ones, `[N, T, S]`."""
+        begin, length = self._begun(given, actions, seed)
+        model = cast(Any, self.world_model.model)
+        drawing = {"generators": begin.generators} if model.samples else {}
+        return model.predict_states(given.latents, begin.conditioning, length, **drawing)
+
+    def _begun(self, given: _Given, actions: Actions, seed: int) -> tuple[Batch, int]:
+        """The beginning of the candidates' clips, and their number of latent frames."""
         world, number, recent = self.world_model, len(actions), given.actions
         rows = torch.cat([recent.expand(number, -1, -1), actions], 1).to(world.action_low.device)
         stride = world.codec.temporal_stride
@@ -271,5 +348,4 @@ class ModelRollouts:
         conditioning = world.conditioner.condition(normalised, length, world.model.width)
         generators = [torch.Generator().manual_seed(seed) for _ in range(number)]
         latents = given.latents.expand(number, -1, -1, -1, -1)
-        begin = Batch(latents, conditioning, generators)
-        return world.objective.predict(world.model, begin, length, self._steps)
+        return Batch(latents, conditioning, generators), length

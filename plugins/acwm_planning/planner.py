@@ -64,6 +64,13 @@ class Futures(ABC):
     def observe(self, frames: Sequence[int]) -> Observation:
         """What these frames show, candidate after candidate, `[N · len(frames), …]`."""
 
+    def predicted(self, frames: Sequence[int]) -> Observation | None:
+        """What the model itself says of these frames, as `observe` returns it; None if nothing.
+
+        No picture is made for it. What it does not say raises `NotPredicted` when it is looked at.
+        """
+        return None
+
     @abstractmethod
     def still(self, picture: Frame) -> Latent:
         """The latent frame of a video in which `picture` stands still, `[1, 1, C, h, w]`."""

@@ -100,7 +100,7 @@ class FlexibleBody(SceneModel[Scene, Form]):
     """
 
     name = "flexible_body"
-    raw_states = True
+    raw_states = predicts_states = True
 
     def __init__(
         self,
@@ -246,6 +246,10 @@ class FlexibleBody(SceneModel[Scene, Form]):
         )
         frames = self.drawn(scene._replace(base=base, canvas=canvas, looks=looks), forms)
         return frames.unflatten(0, numbers.shape)
+
+    def states_of(self, course: Form) -> Tensor:
+        """The states of the forms; see `SceneModel.states_of`."""
+        return self.layout.states(course)
 
     def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
         """The scene as tensors."""

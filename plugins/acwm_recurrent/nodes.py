@@ -110,6 +110,18 @@ class NodeLayout:
             nodes = nodes.index_select(2 + axis, kept)
         return Form(agents.unflatten(2, (self.agents, self.axes)), nodes.flatten(2, -2))
 
+    def states(self, form: Form) -> Tensor:
+        """The states `[B, T, S]` of a form with an axis T; other nodes are on straight lines."""
+        nodes = form.nodes.unflatten(2, self.shape)
+        for axis, (side, kept) in enumerate(zip(self.recorded, self.shape, strict=True), 2):
+            place = torch.arange(side, device=nodes.device) / self.every
+            below = place.long().clamp(max=max(kept - 2, 0))
+            above = (below + 1).clamp(max=kept - 1)
+            first, second = (nodes.index_select(axis, each) for each in (below, above))
+            share = (place - below).view(-1, *[1] * (nodes.ndim - axis - 1))
+            nodes = torch.lerp(first, second, share.to(nodes))
+        return self.unit * torch.cat([form.agents.flatten(2), nodes.flatten(2)], 2)
+
 
 class View(nn.Module):
     """A camera that stands still: where in the picture something is.

@@ -89,7 +89,7 @@ class PlanarBodies(SceneModel[Scene, Poses]):
     """
 
     name = "planar_bodies"
-    raw_states = True
+    raw_states = predicts_states = True
 
     def __init__(
         self,
@@ -219,6 +219,10 @@ class PlanarBodies(SceneModel[Scene, Poses]):
         )
         frames = self.drawn(scene._replace(base=base, canvas=canvas), shown)
         return frames.unflatten(0, numbers.shape)
+
+    def states_of(self, course: Poses) -> Tensor:
+        """The states of the poses; see `SceneModel.states_of`."""
+        return self.layout.states(course)
 
     def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
         """The scene as tensors."""

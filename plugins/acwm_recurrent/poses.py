@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from acwm_core.errors import RecipeError, ShapeError
 
@@ -72,6 +73,21 @@ class Layout:
             places / self.unit,
             direction(self.folds * angles),
         )
+
+    def states(self, poses: Poses) -> Tensor:
+        """The states `[B, T, S]` of poses with an axis T; heights are NaN, as nothing tells them.
+
+        Of angles that look the same, the one that is nearest to 0.
+        """
+        frames = poses.places.shape[1]
+        present = poses.present[:, None, :, 0].expand(-1, frames, -1)
+        places = self.unit * poses.places
+        if self.axes == 3:
+            places = functional.pad(places, (0, 1), value=math.nan)
+        cosine, sine = poses.turns.unbind(-1)
+        angles = torch.atan2(sine, cosine) / self.folds
+        agents = self.unit * poses.agents
+        return torch.cat([agents.flatten(2), present, places.flatten(2), angles], 2)
 
 
 def direction(angle: Tensor) -> Tensor:

@@ -85,6 +85,10 @@ class SceneModel(Predictor, Generic[Scene, Course]):
     def drawn_course(self, scene: Scene, course: Course, numbers: Tensor) -> Latent:
         """Latent frames `[B, N, C, h, w]` with the numbers `[B, N]`, 1 for the first new one."""
 
+    def states_of(self, course: Course) -> Tensor:
+        """The states of a course as they were recorded, `[B, 1 + T, S]`; see `predict_states`."""
+        raise NotImplementedError
+
     @abstractmethod
     def tensors(self, scene: Scene) -> tuple[Tensor, ...]:
         """The scene as tensors."""
@@ -117,6 +121,24 @@ class SceneModel(Predictor, Generic[Scene, Course]):
         if only is not None:
             numbers = numbers.gather(1, only)
         return self.drawn_course(scene, course, numbers)
+
+    def predict_states(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        *,
+        generators: Sequence[torch.Generator] = (),
+    ) -> Tensor:
+        """The states that it would draw; see `Predictor.predict_states`."""
+        number, scene = len(self.told_of(conditioning)), self.start(given)
+        if len(given) < number:
+            alike = [each.expand(number, *each.shape[1:]) for each in self.tensors(scene)]
+            scene = self.scene(tuple(alike))
+        if self.samples:
+            draw = drawn_noise((self.noise,), generators)
+            scene = self.with_draw(scene, sent(draw, given))
+        return self.states_of(self._followed(scene, conditioning, given.shape[1], frames))[:, 1:]
 
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()

@@ -15,7 +15,7 @@ SIGNATURES = {
     "EpisodeDataset": "(path, split, *, growing=False)",
     "Recipe": "(env, codec, model, conditioner, objective, training, data, evaluation, trainer)",
     "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
-    "clip_frames=37, context_frames=1, state_size=0)",
+    "clip_frames=37, context_frames=1, state_shapes=None)",
     "build_world_model": "(recipe, card)",
     "compose": "(recipe, overrides=(), *, sections=None, trusted=None)",
     "evaluate": "(run, *, data=None, overrides=(), out=None, overwrite=False, progress=True)",

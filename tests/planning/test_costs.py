@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,8 +15,11 @@ from acwm_core.errors import AcwmError, RecipeError
 from acwm_core.plugins import catalog
 from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
 from acwm_planning.planner import Cost, Futures
+from acwm_planning.predicted import predicted_observation
 from tests import tiny
 from tests.planning.problems import planned, quadratic
+
+SHAPES = {"position": (2,)}
 
 
 class Known(Futures):
@@ -82,6 +86,46 @@ def test_frames_with_an_unknown_distance_are_penalised(unknown):
         Known(np.full_like(places, math.nan)), tiny.PLACE, GOAL
     )
     torch.testing.assert_close(nothing, torch.full((3,), unknown))
+
+
+class Predicted(Known):
+    """Of a model that says that all is at (14, 14), whatever the pictures show."""
+
+    shapes = SHAPES
+
+    def predicted(self, frames):
+        return predicted_observation(torch.full((3 * len(frames), 2), 14.0), self.shapes)
+
+
+class Elsewhere(Predicted):
+    shapes: ClassVar = {"speed": (2,)}
+
+
+@pytest.mark.parametrize("read", ["pictures", "model", None])
+def test_states_are_the_model_s_own_where_it_predicts_them(read):
+    pictures = StateDistance(frames=1)(Known(PLACES + 3), tiny.PLACE, GOAL)
+    found = StateDistance(frames=1, read=read)(Predicted(PLACES + 3), tiny.PLACE, GOAL)
+    assert found.equal(pictures if read == "pictures" else torch.zeros(3))
+
+
+def test_what_a_model_does_not_predict_is_read_from_pictures():
+    pictures = StateDistance(frames=1)(Known(PLACES), tiny.PLACE, GOAL)
+    assert StateDistance(frames=1)(Elsewhere(PLACES), tiny.PLACE, GOAL).equal(pictures)
+    with pytest.raises(RecipeError, match="predicts speed, and the task looks at position: set"):
+        StateDistance(read="model")(Elsewhere(PLACES), tiny.PLACE, GOAL)
+    with pytest.raises(RecipeError, match=r"predicts no states: set cost\.read=pictures"):
+        StateDistance(read="model")(Known(PLACES), tiny.PLACE, GOAL)
+    with pytest.raises(RecipeError, match="give model, pictures or null"):
+        StateDistance(read="both")
+
+
+@pytest.mark.parametrize("look", [lambda m: m == 1, lambda m: m[0], lambda m: np.asarray(m).sum()])
+def test_a_model_that_predicts_states_predicts_no_masks(look):
+    """A task that looks at masks gets those of pictures, and no empty ones."""
+    seen = predicted_observation(torch.zeros(3, 2), SHAPES)
+    assert len(seen.masks) == 3
+    with pytest.raises(RecipeError, match="the task looks at masks"):
+        look(seen.masks)
 
 
 def test_frames_that_are_judged_end_with_the_last():

@@ -8,7 +8,7 @@ import torch
 
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.training.run import load_run
-from acwm_planning.futures import GoalCost, History, ModelRollouts
+from acwm_planning.futures import GoalCost, History, ModelFutures, ModelRollouts
 from tests import tiny
 
 STILL = np.zeros(2, np.float32)
@@ -173,7 +173,6 @@ def test_a_prediction_that_is_not_finite_costs_nan_whatever_the_cost_says(bundle
 def test_a_memoryless_codec_decodes_no_more_than_is_asked_for(monkeypatch, fast, tolerance):
     """The pictures are those of the whole video, in bfloat16 too."""
     from acwm_core.plugins import catalog
-    from acwm_planning.futures import ModelFutures
 
     monkeypatch.setattr("acwm_planning.futures.cpu_has_fast_bfloat16", lambda: fast)
 
@@ -181,11 +180,29 @@ def test_a_memoryless_codec_decodes_no_more_than_is_asked_for(monkeypatch, fast,
     assert codec.memoryless
     latents = torch.randn(2, 4, codec.channels, 4, 4, generator=torch.Generator().manual_seed(0))
     video = codec.decode(latents)
-    futures = ModelFutures(codec, latents[:, 1:], latents[:, :1], 1, None, {})
+    futures = ModelFutures(
+        codec, latents[:, :1], 0, 3, lambda frames: latents[:, 1:][:, list(frames)], 1, None, []
+    )
     with torch.no_grad():
         made = futures.video([0, 2])
     assert made.dtype == torch.float32
     torch.testing.assert_close(made, video[:, [4, 10]], atol=tolerance, rtol=0)
+
+
+def test_a_frame_is_predicted_once(bundle, history):
+    """Whatever a cost asks for, and in which order."""
+    asked, latents = [], torch.randn(2, 4, 16, 4, 4)
+
+    def predict(frames):
+        asked.append(list(frames))
+        return latents[:, 1:][:, list(frames)]
+
+    codec = bundle.world_model.codec
+    futures = ModelFutures(codec, latents[:, :1], 0, 3, predict, 1, None, [])
+    assert futures.latents([2]).equal(latents[:, 3:])
+    assert futures.latents([0, 2]).equal(latents[:, [1, 3]])
+    assert futures.finite.all()
+    assert asked == [[2], [0]]
 
 
 def test_longer_plans_than_the_model_knows_are_refused(bundle, history):

@@ -27,7 +27,9 @@ def world_of(model, stride=4, *, states=0, objective=None):
         heads=model.heads,
     )
     of = objective or Regression()
-    return WorldModel(world_codec(stride), model, conditioner, of, *BOUNDS, state_size=states)
+    return WorldModel(
+        world_codec(stride), model, conditioner, of, *BOUNDS, state_shapes={"all": (states,)}
+    )
 
 
 def moving_dots(batch, seed):

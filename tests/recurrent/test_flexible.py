@@ -68,6 +68,35 @@ def test_states_are_nodes_in_units():
         NodeLayout(1, [3, 2, 2], 1, 0.1, 24)
 
 
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_forms_are_told_as_they_were_recorded(every):
+    """Of a flat cloth, the nodes that are left out too."""
+    down, across = torch.meshgrid(torch.arange(7.0), torch.arange(5.0), indexing="ij")
+    nodes = torch.stack([down, 2 * across, down - across], -1).flatten()
+    states = torch.cat([torch.arange(6.0), nodes])[None, None] * 0.3
+    layout = NodeLayout(2, [7, 5], every, 0.1, states.shape[2])
+    torch.testing.assert_close(layout.states(layout.form(states)), states)
+
+
+def test_it_draws_the_states_that_it_predicts():
+    """Told them as true ones, it draws the same pictures; alike beginnings may be given once."""
+    torch.manual_seed(0)
+    model = model_of_ropes(every=2).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    given = torch.randn(1, 1, 2, 8, 8)
+    clips = Conditioning(torch.randn(3, 6, model.width), None, None)
+    with torch.no_grad():
+        states = model.predict_states(given, clips, 6)
+        given = given.expand(3, -1, -1, -1, -1)
+        own = model(given, clips, 6)
+        first = model.layout.states(Form(*(each[:, None] for each in model.start(given).form)))
+        drawn = model(given, clips, 6, states=torch.cat([first, states], 1))
+        torch.testing.assert_close(states, model.predict_states(given, clips, 6))
+    assert states.shape == (3, 5, 2 + 2 * NODES)
+    torch.testing.assert_close(drawn, own, atol=1e-4, rtol=1e-3)
+
+
 @pytest.mark.parametrize("aspect", [1.0, 1.75])
 def test_the_view_is_that_of_the_renderer(aspect):
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))

@@ -13,7 +13,7 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.objectives.regression import Regression
 from acwm_recurrent.motion import HIDDEN, BodyMotion, Moving
 from acwm_recurrent.planar import PlanarBodies
-from acwm_recurrent.poses import Layout, Poses, direction, pose_at, turned, turned_back
+from acwm_recurrent.poses import Layout, Poses, direction, pose_at, stacked, turned, turned_back
 from acwm_recurrent.windows import HORIZONS, moving_windows
 from tests.recurrent.dots import world_of
 
@@ -66,6 +66,39 @@ def test_states_are_poses_in_units():
         Layout(1, 2, 4, 0.1, 12).poses(states[..., :9])
     with pytest.raises(RecipeError, match="must be positive"):
         model_of_pucks(blocks=0)
+
+
+def test_poses_are_told_as_they_were_recorded():
+    """But for heights, which nobody knows, and of angles that look the same the smallest."""
+    states = torch.tensor([[[0.1, -0.2, 1, 0, 0.3, 0.4, 9.0, 0, 0, 9.0, math.pi / 8, 2.0]]])
+    layout = Layout(1, 2, 4, 0.1, 12)
+    told = layout.states(layout.poses(states))
+    assert told[0, 0, [6, 9]].isnan().all()
+    states[0, 0, [6, 9]], states[0, 0, 11] = math.nan, 2.0 - math.pi / 2
+    torch.testing.assert_close(told, states, equal_nan=True)
+
+
+@pytest.mark.parametrize("noise", [0, 3])
+def test_it_draws_the_states_that_it_predicts(noise):
+    """Told them as true ones, it draws the same pictures, of the same draw."""
+    torch.manual_seed(0)
+    model = model_of_pucks(noise=noise).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    given = torch.randn(1, 1, 2, 8, 8)
+    clips = Conditioning(torch.randn(3, 6, model.width), None, None)
+
+    def drawing():
+        made = [torch.Generator().manual_seed(seed) for seed in range(3)]
+        return {"generators": made} if noise else {}
+
+    with torch.no_grad():
+        states = model.predict_states(given, clips, 6, **drawing())
+        given = given.expand(3, -1, -1, -1, -1)
+        own = model(given, clips, 6, **drawing())
+        first = model.layout.states(stacked([model.start(given).moving.poses]))
+        drawn = model(given, clips, 6, states=torch.cat([first, states], 1))
+    torch.testing.assert_close(drawn, own, atol=1e-4, rtol=1e-3)
 
 
 def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():

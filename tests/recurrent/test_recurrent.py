@@ -87,6 +87,20 @@ def test_nothing_is_random(world):
     torch.testing.assert_close(one, other)
 
 
+def test_frames_asked_for_alone_are_those_of_the_whole_clip(world, monkeypatch):
+    """Which saves reading the others."""
+    given = torch.randn(2, 2, world_codec().channels, 8, 8)
+    modulation = torch.randn(2, 7, world.model.width)
+    clip = Batch(given, Conditioning(modulation, None, None), [torch.Generator()] * 2)
+    read, read_all = [], world.model._read
+    monkeypatch.setattr(world.model, "_read", lambda *a: read.append(len(a[0])) or read_all(*a))
+    with torch.no_grad():
+        whole = world.objective.predict(world.model, clip, 7)
+        some = world.objective.predict_frames(world.model, clip, 7, [6, 3])
+    torch.testing.assert_close(some, whole[:, [6, 3]])
+    assert read == [2 * 5, 2 * 2]
+
+
 def test_a_fresh_model_repeats_the_given_frame():
     model = RecurrentModel(latent_channels=4)
     given = torch.randn(2, 1, 4, 8, 8)

@@ -120,6 +120,23 @@ class Objective(ABC, Generic[ModelT]):
             `[B, L, C, h, w]`; its first K frames are `given`.
         """
 
+    def predict_frames(
+        self,
+        model: ModelT,
+        given: Batch,
+        frames: int,
+        only: Sequence[int],
+        steps: int | None = None,
+    ) -> Latent:
+        """The predicted frames of these numbers alone, `[B, len(only), C, h, w]`; see `predict`.
+
+        Other frames are saved by objectives whose models can (`Predictor.skips`).
+
+        Args:
+            only: K for the first frame that is predicted, up to L - 1.
+        """
+        return self.predict(model, given, frames, steps)[:, list(only)]
+
     def stream(
         self,
         model: ModelT,

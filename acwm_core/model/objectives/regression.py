@@ -81,6 +81,22 @@ class Regression(Objective[Predictor]):
         latents = given.latents
         return torch.cat([latents, _predicted(model, given, frames).to(latents)], 1)
 
+    def predict_frames(
+        self,
+        model: Predictor,
+        given: Batch,
+        frames: int,
+        only: Sequence[int],
+        steps: int | None = None,
+    ) -> Latent:
+        """Predict these frames of the clip; see `Objective.predict_frames`."""
+        if not model.skips:
+            return super().predict_frames(model, given, frames, only, steps)
+        batch, known = given.latents.shape[:2]
+        numbers = torch.tensor([[number - known for number in only]], device=given.latents.device)
+        made = _predicted(model, given, frames, numbers.expand(batch, -1))
+        return made.to(given.latents)
+
     def stream(
         self,
         model: Predictor,
