@@ -302,10 +302,19 @@ class ModelRollouts:
 
         latents = given.latents.expand(len(actions), -1, -1, -1, -1)
         world = self.world_model
-        mine = isinstance(world.model, Predictor) and world.model.predicts_states
-        told = (states if mine else None), world.state_shapes
+        tells = isinstance(world.model, Predictor) and world.model.predicts_states
+        own = states if tells and world.state_shapes else None
         futures = ModelFutures(
-            codec, latents, past, length, predict, last, self._estimator, stills, *told
+            codec,
+            latents,
+            past,
+            length,
+            predict,
+            last,
+            self._estimator,
+            stills,
+            own,
+            world.state_shapes,
         )
         if not (isinstance(world.model, Predictor) and world.model.skips):
             futures.latents(range(-past, length))  # all at once

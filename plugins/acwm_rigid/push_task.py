@@ -33,7 +33,7 @@ class Place(Task):
     # four straight moves of 8 frames reach around a cube, at the speed of the pushes in the data.
     planning = (
         *("planner.interpolation=linear", "planner.action_block=8", "planner.horizon=4"),
-        *("planner.candidates=96", "planner.iterations=4", "planner.elites=10"),
+        *("planner.candidates=512", "planner.iterations=5", "planner.elites=20"),
         *("cost=state", "cost.frames=2"),
     )
 
