@@ -205,6 +205,44 @@ def test_a_frame_is_predicted_once(bundle, history):
     assert asked == [[2], [0]]
 
 
+@pytest.mark.parametrize("past", [0, 1])
+def test_predicted_states_are_those_of_the_last_planned_frames(bundle, history, past, monkeypatch):
+    """Of a model that counts video frames from the given one on, and of plans of five actions."""
+    world, stride = bundle.world_model, bundle.world_model.codec.temporal_stride
+
+    def count(given, conditioning, frames, **_):
+        assert len(given) == 1
+        number = stride * (frames - given.shape[1])
+        return torch.arange(1.0, 1 + number)[:, None].expand(3, -1, 2)
+
+    monkeypatch.setattr(world, "state_shapes", {"pair": (2,)})
+    monkeypatch.setattr("acwm_planning.futures.Predictor", type(world.model))
+    for name, value in (("predicts_states", True), ("skips", False)):
+        monkeypatch.setattr(world.model, name, value, raising=False)
+    monkeypatch.setattr(world.model, "predict_states", count, raising=False)
+    rollouts = ModelRollouts(world, bundle.card, None, past=past)
+    (futures,) = seen(rollouts, history, candidates(3, 5))
+    now = past * stride
+    wanted = [now + stride, now + 5]
+    pair = futures.predicted([0, futures.length - 1]).states["pair"]
+    np.testing.assert_array_equal(pair.reshape(3, 2, 2)[1], [[each] * 2 for each in wanted])
+
+
+@pytest.mark.parametrize("diverged", [[], [1], [0, 1, 2]])
+def test_states_that_are_not_finite_are_no_prediction(bundle, diverged):
+    """But for those that the model never knows."""
+    states = torch.zeros(3, 4, 2)
+    states[..., 1] = torch.nan
+    states[diverged, 2:] = torch.nan
+    given = torch.zeros(3, 1, 16, 4, 4)
+    codec, shapes = bundle.world_model.codec, {"known": (1,), "unknown": (1,)}
+    if len(diverged) == 3:
+        states[:] = torch.nan
+    futures = ModelFutures(codec, given, 0, 2, None, 1, None, [], lambda: states, shapes)
+    futures.predicted([0])
+    assert futures.finite.tolist() == [clip not in diverged for clip in range(3)]
+
+
 def test_longer_plans_than_the_model_knows_are_refused(bundle, history):
     with pytest.raises(RecipeError, match="trained on clips of 9 frames"):
         seen(ModelRollouts(bundle.world_model, bundle.card, None), history, candidates(1, 10))
