@@ -71,6 +71,9 @@ class SimulatorFutures(Futures):
             reconstructions = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
         return self._estimator.read(reconstructions.cpu())
 
+    def predicted(self, frames: Sequence[int]) -> Observation:
+        return self.observe(frames)
+
     def still(self, picture: Frame) -> Latent:
         if self._codec is None:
             raise RecipeError("the simulator has no latents: take cost=state")

@@ -135,6 +135,7 @@ def test_the_simulator_s_futures_are_what_happens():
     futures = SimulatorFutures(tiny.Slide(), history, actions, 2, None)
     assert futures.length == 3
     found = futures.observe([0, 2]).states["position"].reshape(3, 2, 2)
+    assert futures.predicted([0, 2]) is futures.observe([0, 2])  # with cost.read=model, too
     video = futures.video([0, 2])
     for candidate, rows in enumerate(actions.numpy()):
         episode = simulate(environment, tiny.spec(4), np.concatenate([past, rows]), frames=9)
