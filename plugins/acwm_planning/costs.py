@@ -13,7 +13,7 @@ from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import RecipeError, noting
 from acwm_core.recipe.trust import import_named
 from acwm_planning.planner import Cost, Futures
-from acwm_planning.predicted import NotPredicted
+from acwm_planning.predicted import NotPredicted, PredictedStates
 
 
 def last_frames(length: int, frames: int | None) -> list[int]:
@@ -104,6 +104,11 @@ class StateDistance(Cost):
         distances = judged(task, "distance", seen, goal).reshape(-1, frames) / task.tolerance
         failed = judged(task, "failed", seen, goal).reshape(-1, frames).any(1)
         known = np.isfinite(distances)
+        if isinstance(seen.states, PredictedStates) and not known.any():
+            # It may know a field in part, such as where a body is and not how high.
+            raise NotPredicted(
+                "of what the model predicts no distance can be told: set cost.read=pictures"
+            )
         total = np.where(known, distances, 0).sum(1)
         mean = total / np.maximum(known.sum(1), 1)
         mean = np.where(known.any(1), mean, mean.max(initial=0))

@@ -136,8 +136,7 @@ class SceneModel(Predictor, Generic[Scene, Course]):
             alike = [each.expand(number, *each.shape[1:]) for each in self.tensors(scene)]
             scene = self.scene(tuple(alike))
         if self.samples:
-            draw = drawn_noise((self.noise,), generators)
-            scene = self.with_draw(scene, sent(draw, given))
+            scene = self.with_draw(scene, *self._draw(given, generators))
         return self.states_of(self._followed(scene, conditioning, given.shape[1], frames))[:, 1:]
 
     def stream(

@@ -119,6 +119,23 @@ def test_what_a_model_does_not_predict_is_read_from_pictures():
         StateDistance(read="both")
 
 
+class Half(Predicted):
+    """Of a model that does not know the second coordinate."""
+
+    def predicted(self, frames):
+        states = torch.full((3 * len(frames), 2), 14.0)
+        states[:, 1] = torch.nan
+        return predicted_observation(states, self.shapes)
+
+
+def test_what_a_model_predicts_in_part_is_read_from_pictures():
+    """And not planned by without a distance."""
+    pictures = StateDistance(frames=1)(Known(PLACES), tiny.PLACE, GOAL)
+    assert StateDistance(frames=1)(Half(PLACES), tiny.PLACE, GOAL).equal(pictures)
+    with pytest.raises(RecipeError, match="no distance can be told: set"):
+        StateDistance(read="model")(Half(PLACES), tiny.PLACE, GOAL)
+
+
 @pytest.mark.parametrize("look", [lambda m: m == 1, lambda m: m[0], lambda m: np.asarray(m).sum()])
 def test_a_model_that_predicts_states_predicts_no_masks(look):
     """A task that looks at masks gets those of pictures, and no empty ones."""
