@@ -131,13 +131,13 @@ def _versions(component: Component) -> str:
 def _accelerator() -> str:
     import torch
 
-    from acwm_core.model.codec import cpu_has_fast_bfloat16
+    from acwm_core.training.precision import automatic_precision
 
+    precision = f"training uses trainer.precision={automatic_precision('auto')}"
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())}
-        return f"{torch.cuda.device_count()} × {', '.join(names)}"
-    arithmetic = "bfloat16 in hardware" if cpu_has_fast_bfloat16() else "float32 only"
-    return f"none; training uses the CPU ({arithmetic})"
+        return f"{torch.cuda.device_count()} × {', '.join(names)}; {precision}"
+    return f"none; {precision} on the CPU"
 
 
 def _reason(stderr: str) -> str:

@@ -32,7 +32,8 @@ from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError, noting
 from acwm_core.executors import Report, progress_bar
 from acwm_core.files import alone, parse_json, writing, written_whole
-from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
+from acwm_core.model.codec import Codec
+from acwm_core.model.precision import bfloat16_is_fast
 
 LATENTS = "latents"
 CARD = "latents.json"
@@ -179,7 +180,7 @@ def _encode_episode(
     if folder.symmetry:
         pixels = folder.symmetry.of_frames(pixels).copy()
     video = torch.as_tensor(pixels).to(device).float() / 255
-    fast = codec.encodes_in_bfloat16 and device.type == "cpu" and cpu_has_fast_bfloat16()
+    fast = codec.encodes_in_bfloat16 and device.type == "cpu" and bfloat16_is_fast()
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=fast):
         if codec.memoryless and folder.stride % group == 0 and (frames - 1) % group == 0:
             latents = _encode_shared(codec, video, starts, frames)

@@ -30,6 +30,7 @@ from acwm_core.training.data import ClipData
 from acwm_core.training.growing import GrowingClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
 from acwm_core.training.module import TrainingModule
+from acwm_core.training.precision import with_recorded_precision
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.resume import (
     AUTO,
@@ -80,6 +81,8 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         with first_decides():
             claim.enter_context(claimed(run))
             checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
+        if checkpoint:
+            recipe = with_recorded_precision(recipe, Recipe.from_yaml(run.recipe), checkpoint)
         first_step = read_step(checkpoint) if checkpoint else 0
         if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
             loggers = build_loggers(run, recipe.trainer, first_step)

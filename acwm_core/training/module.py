@@ -34,6 +34,7 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
+from acwm_core.training.precision import PRECISION
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 """Separate random streams, so that validation never repeats the noise of a training step."""
@@ -237,8 +238,9 @@ class TrainingModule(L.LightningModule):
         update_average(self.averaged, self.world_model, decay)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Leave out the frozen codec, which the run's recipe names."""
+        """Leave out the frozen codec, which the run's recipe names; record the precision."""
         checkpoint["state_dict"] = without_codec(checkpoint["state_dict"])
+        checkpoint[PRECISION] = self.trainer.precision
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set batch counters as if all steps had used the current number of batches per step."""

@@ -16,6 +16,7 @@ from acwm_core.errors import TrainingError
 from acwm_core.files import held, written_whole
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.checkpoints import check_sums, last_whole
+from acwm_core.training.precision import with_recorded_precision
 from acwm_core.training.run import read_metadata
 from acwm_core.training.run_folder import RunFolder
 from acwm_core.training.signals import StoppedEarly
@@ -69,7 +70,11 @@ def checkpoint_to_resume(
     if resume is None:
         way = f"continue it by resume={run.path}" if last else "it has no checkpoint: remove it"
         raise TrainingError(f"{run.path} holds a run already: {way}, or choose another --out")
-    differences = recipe_differences(Recipe.from_yaml(run.recipe), recipe)
+    before = Recipe.from_yaml(run.recipe)
+    if last is not None:
+        recipe = with_recorded_precision(recipe, before, last)
+        before = with_recorded_precision(before, before, last)
+    differences = recipe_differences(before, recipe)
     differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
     if differences:
         raise TrainingError(

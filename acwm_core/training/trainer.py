@@ -23,8 +23,8 @@ from lightning.pytorch.strategies import (
 )
 
 from acwm_core.errors import RecipeError, TrainingError
-from acwm_core.model.codec import cpu_has_fast_bfloat16
 from acwm_core.training.config import TrainingConfig, chosen_loggers
+from acwm_core.training.precision import automatic_precision, warn_if_emulated
 from acwm_core.training.sharding import CheckpointFiles, ShardedStrategy
 
 
@@ -49,9 +49,12 @@ def build_trainer(
         flags = {**flags, "logger": others}
     chosen = instantiate_flags(flags)
     _check_flags(chosen, config)
+    accelerator = chosen.get("accelerator", "auto")
+    if "precision" in chosen:
+        warn_if_emulated(chosen["precision"], accelerator)
     accumulated = chosen.get("accumulate_grad_batches", 1)
     ours: dict[str, Any] = {
-        "precision": automatic_precision(chosen.get("accelerator", "auto")),
+        "precision": chosen.get("precision") or automatic_precision(accelerator),
         "max_epochs": -1,
         "val_check_interval": config.validate_every_n_steps * accumulated,
         "check_val_every_n_epoch": None,  # validate by steps; the clips have no end
@@ -173,11 +176,3 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
     ):
         if wrong:
             raise TrainingError(message)
-
-
-def automatic_precision(accelerator: object) -> str:
-    """`bf16-mixed` where it is faster than `32-true`: on GPUs and CPUs that support bfloat16."""
-    if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available():
-        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
-    fast = accelerator in ("auto", "cpu") and cpu_has_fast_bfloat16()
-    return "bf16-mixed" if fast else "32-true"

@@ -34,6 +34,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_core.files import load_plain, training_record, written_whole
+from acwm_core.model.precision import bfloat16_is_fast
 from acwm_core.model.shapes import check_finite
 
 CODECS: dict[str, type[Compact]] = {
@@ -68,7 +69,7 @@ def measure_latents(codec: Compact, sources: Sequence[Source], batch: int, seed:
     codec.normalise.train().momentum = None  # an average over all batches
     for _ in range(MEASURED_BATCHES):
         groups = sample_groups(sources, batch, rng)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16_is_fast()):
             codec.normalise(codec.encoder(groups.frames * 2 - 1))
     codec.normalise.eval()
 
@@ -86,7 +87,7 @@ def losses(
     frames, reference = groups.frames, groups.references
     if torch.rand((), generator=generator) < WITHOUT_REFERENCE:
         reference = None
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16_is_fast()):
         latents = codec.normalise(codec.encoder(frames[~groups.predicted] * 2 - 1))
         noise = torch.randn(latents.shape, generator=generator)
         kept = torch.rand(latents[:, :1].shape, generator=generator) >= EMPTY_FRACTION
@@ -379,7 +380,7 @@ def reconstruction(codec: Compact, folder: Path) -> float | None:
         pixels += video[0, :, 0].numel()
         if errors and pixels > TEST_PIXELS:
             break
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16_is_fast()):
             decoded = codec(video).float()
         errors.append((decoded - video).square().mean().item())
     codec.train(training)

@@ -20,9 +20,10 @@ from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.model.codec import Codec, cpu_has_fast_bfloat16
+from acwm_core.model.codec import Codec
 from acwm_core.model.dynamics import Predictor
 from acwm_core.model.objectives.objective import Batch
+from acwm_core.model.precision import bfloat16_is_fast
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
@@ -126,7 +127,7 @@ class ModelFutures(Futures):
         On a CPU that has it, in bfloat16: decoding takes most of a decision, and is twice as fast.
         """
         device = self._given.device.type
-        fast = device == "cpu" and cpu_has_fast_bfloat16()
+        fast = device == "cpu" and bfloat16_is_fast()
         with torch.autocast(device, torch.bfloat16, enabled=fast):
             return self._decode(list(frames)).float()
 

@@ -174,7 +174,7 @@ def test_a_memoryless_codec_decodes_no_more_than_is_asked_for(monkeypatch, fast,
     """The pictures are those of the whole video, in bfloat16 too."""
     from acwm_core.plugins import catalog
 
-    monkeypatch.setattr("acwm_planning.futures.cpu_has_fast_bfloat16", lambda: fast)
+    monkeypatch.setattr("acwm_planning.futures.bfloat16_is_fast", lambda: fast)
 
     codec = catalog().create("codec", "compact")
     assert codec.memoryless

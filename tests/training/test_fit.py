@@ -15,9 +15,9 @@ from acwm_core.errors import TrainingError
 from acwm_core.training.callbacks import CpuTime
 from acwm_core.training.fit import fit
 from acwm_core.training.module import VALIDATION_NOISE, generator_of
+from acwm_core.training.precision import automatic_precision
 from acwm_core.training.run import load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
-from acwm_core.training.trainer import automatic_precision
 from acwm_metrics.torchmetrics import as_torchmetric
 from tests.tiny import tiny_recipe
 from tests.training.callbacks import Kill, Killed

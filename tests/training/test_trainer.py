@@ -16,7 +16,7 @@ from acwm_core.training.module import TrainingModule
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.run_folder import RunFolder
 from acwm_core.training.sharding import ShardedStrategy
-from acwm_core.training.trainer import automatic_precision, build_trainer, instantiate_flags
+from acwm_core.training.trainer import build_trainer, instantiate_flags
 from tests.tiny import tiny_world_model
 
 
@@ -116,26 +116,6 @@ def test_a_recipe_for_gpus_on_a_machine_without_says_what_to_do(monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(TrainingError, match=r"no GPU here .* by \+small"):
         build(accelerator="gpu", devices=8)
-
-
-@pytest.mark.parametrize(
-    ("cuda", "amx", "avx", "accelerator", "expected"),
-    [
-        (False, False, False, "auto", "32-true"),
-        (False, True, False, "auto", "bf16-mixed"),
-        (False, False, True, "auto", "bf16-mixed"),
-        (False, True, False, "cpu", "bf16-mixed"),
-        (True, False, False, "auto", "bf16-mixed"),
-        (True, False, False, "cpu", "32-true"),
-        (False, True, True, "mps", "32-true"),
-    ],
-)
-def test_precision_follows_the_hardware(cuda, amx, avx, accelerator, expected, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
-    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx)
-    assert automatic_precision(accelerator) == expected
 
 
 def test_with_a_gradient_scaler_only_the_loss_must_be_finite(tmp_path):
