@@ -1,4 +1,4 @@
-"""Who makes the squared error of a model's predictions: the codec, the world, or the model."""
+"""Where the squared error of predictions comes from: the codec, the world, or the model."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from acwm_core.evaluation.statistics import Estimate
 class ErrorShares:
     """Shares of the model's mean squared error, each at most 1.
 
-    Errors of different origin are taken to add up, so this is a rough account.
+    Errors of different origin are assumed to add up, so the shares are approximate.
 
     Attributes:
-        codec: what the codec's reconstruction of the truth has: the part of the ``codec`` row.
-        world: what the simulator has that starts slightly elsewhere: the part of the ``perturbed``
-            row, of a few clips; None if it was not run.
+        codec: the error of the codec's reconstruction of the truth (row ``codec``).
+        world: irreducible uncertainty: the error of the simulator from a slightly different start
+            (row ``perturbed``, of a few clips); None if it was not run.
     """
 
     codec: float
@@ -31,11 +31,12 @@ class ErrorShares:
         return max(0.0, 1 - self.codec - (self.world or 0))
 
     def __str__(self) -> str:
-        """For example ``the codec alone makes 43 % of the squared error, the model 57 %``."""
-        parts = [f"the codec alone makes {100 * self.codec:.0f} % of the squared error"]
+        """For example ``shares of the squared error: codec alone 43 %, model 57 %``."""
+        parts = [f"codec alone {100 * self.codec:.0f} %"]
         if self.world is not None:
-            parts.append(f"the world's own doubt {100 * self.world:.0f} %")
-        return ", ".join([*parts, f"the model {100 * self.model:.0f} %"])
+            parts.append(f"irreducible uncertainty {100 * self.world:.0f} %")
+        parts.append(f"model {100 * self.model:.0f} %")
+        return f"shares of the squared error: {', '.join(parts)}"
 
 
 def error_shares(scores: SetSummary) -> ErrorShares | None:

@@ -50,7 +50,7 @@ def score_tables(run: EvaluatedRun) -> list[Table]:
         views = dict.fromkeys(view for _, view in places)
         rows = [row for view in views for row in _score_rows(run, split, scales, view)]
         title, parts = _title(split, result), error_shares(result.scores)
-        about = f"Roughly, {parts}." if parts else ""
+        about = f"Approximate {parts}." if parts else ""
         drawn = draws_phrase(run.summary, split)
         about = " ".join(filter(None, (about, f"{drawn[:1].upper()}{drawn[1:]}." if drawn else "")))
         tables.append(Table(title, columns, rows, "Prediction", about, f"scores-{split}"))

@@ -74,12 +74,12 @@ def print_summary(summary: Summary) -> None:
 
 
 def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
-    """Print who makes the error, which predictions failed, and which scores are left out."""
+    """Print where the error comes from, which predictions failed, and which scores are left out."""
     better = "hand in PNG or NPZ" if handed_in else "see `acwm train-codec`"
     from acwm_core.evaluation.shares import error_shares
 
     if found := error_shares(scores):
-        click.echo(f"{found}{f': {better}' if found.codec > MUCH else ''}")
+        click.echo(f"{found}{f' ({better})' if found.codec > MUCH else ''}")
     for row in scores.failed:
         failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"
         click.echo(f"{failures}: their scores count as infinitely bad")

@@ -146,14 +146,14 @@ def _scores(summary: Summary) -> str:
 
 
 def _ceilings(summary: Summary) -> str:
-    """What the headline metric could be, and who makes the squared error; a line per split."""
+    """The headline metric and its bounds, and where the squared error comes from, per split."""
     lines: list[str] = []
     for split, result in summary.splits.items():
         rows = {row: found.get(summary.headline) for row, found in result.scores.rows.items()}
         beside = [f"{title} {_shown(rows[row])}" for row, title in ROWS.items() if row in rows]
         text = f"{summary.metrics[summary.headline].title} {SPLITS.get(split, split)}: "
         parts = error_shares(result.scores)
-        lines.append(f"- {text}{', '.join(beside)}{f'. Roughly, {parts}' if parts else ''}.\n")
+        lines.append(f"- {text}{', '.join(beside)}{f'. Approximate {parts}' if parts else ''}.\n")
     return "".join(lines)
 
 

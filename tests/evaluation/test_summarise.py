@@ -109,7 +109,7 @@ def test_results_survive_parquet(tmp_path):
 
 
 @pytest.mark.parametrize("metric", ["mse", "psnr"])
-def test_whose_the_squared_error_is(metric):
+def test_where_the_squared_error_comes_from(metric):
     errors = {"model": 0.01, "codec": 0.0025, "perturbed": 0.001, "copy": 0.03}
     values = {k: v if metric == "mse" else -10 * math.log10(v) for k, v in errors.items()}
     rows = {kind: {metric: Estimate(value)} for kind, value in values.items()}
