@@ -18,12 +18,13 @@ import torch
 from PIL import Image
 
 from acwm_core.data.card import DatasetCard
+from acwm_core.data.pictures import Picture, join, moments, to_pixels
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.evaluation.results import SetSummary, Summary
 from acwm_core.evaluation.shares import error_shares
 from acwm_core.training.run import load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
-from acwm_formats.sheets import Picture, below, beside, magnified
+from acwm_formats.sheets import GAP, magnified
 from acwm_zoo.shipped import folder, shipped
 
 SPLITS = ("ind_test", "ood_test")
@@ -47,11 +48,8 @@ def main(picture: Path | None) -> None:
         worlds = [name for name in shipped() if name == world_of(name)]  # no second one of a world
         rows = [strip(name) for name in worlds]
         half = -(-len(rows) // 2)
-        columns = [below(rows[:half], gap=12), below(rows[half:], gap=12)]
-        height = max(map(len, columns))
-        fill = [((0, height - len(each)), (0, 0), (0, 0)) for each in columns]
-        filled = [np.pad(c, f, constant_values=255) for c, f in zip(columns, fill, strict=True)]
-        Image.fromarray(beside(filled)).save(picture, quality=88)
+        columns = [join(column, down=True, gap=12) for column in (rows[:half], rows[half:])]
+        Image.fromarray(join(columns, gap=GAP)).save(picture, quality=88)
 
 
 def world_of(name: str) -> str:
@@ -107,10 +105,11 @@ def strip(name: str) -> Picture:
     first = torch.from_numpy(truth[:1]).permute(0, 3, 1, 2).float() / 255
     actions = torch.from_numpy(shown.actions)[None]
     predicted = bundle.world_model.rollout(first, actions, check=False)[0]
-    made = (255 * predicted.permute(0, 2, 3, 1)).round().byte().numpy()
     height, width = truth.shape[1:3]
-    moments = np.linspace(0, len(truth) - 1, MOMENTS * height // width).round().astype(int)
-    return below([beside([magnified(v[t]) for t in moments]) for v in (truth, made)], gap=2)
+    chosen = moments(len(truth), MOMENTS * height // width)
+    videos = truth, to_pixels(predicted)
+    rows = [join([magnified(video[t]) for t in chosen], gap=GAP) for video in videos]
+    return join(rows, down=True, gap=2)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from av.codec.context import Flags
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from acwm_core.data.pictures import enlarge
 from acwm_core.env.card import exact_rate
 from acwm_core.errors import DataError, ShapeError
 from acwm_core.files import written_whole
@@ -155,7 +156,7 @@ def write_mp4(
 def _even(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise ShapeError(f"a frame is {frame.dtype} {frame.shape}, not uint8 [H, W, 3]")
-    large = frame.repeat(scale, axis=0).repeat(scale, axis=1)
+    large = enlarge(frame, scale)
     return large[: len(large) // 2 * 2, : large.shape[1] // 2 * 2]
 
 

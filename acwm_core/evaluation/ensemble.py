@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.pictures import to_pixels
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode
 from acwm_core.env.physics import StateEstimator
@@ -24,7 +25,6 @@ from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Ensemble
 from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import ClipScores, Estimate, Values, finite
-from acwm_core.evaluation.videos import to_pixels
 
 RESOLVED = 12**-0.5
 """Standard deviation, in pixels, of a place that is known up to the pixel in which it is."""

@@ -16,6 +16,7 @@ import torch
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.pictures import magnification
 from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
@@ -39,7 +40,7 @@ from acwm_core.evaluation.storage import (
     write_scores,
 )
 from acwm_core.evaluation.summarise import gap, summarise_split
-from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip, magnification
+from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip
 from acwm_core.evaluation.views import metrics_of_views
 from acwm_core.files import held, writing, written_whole
 from acwm_core.recipe import Recipe, compose

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.data.pictures import Picture, join, to_pixels
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.results import DIVIDER, Score, VideoRecord
 from acwm_core.evaluation.statistics import finite
@@ -15,9 +16,6 @@ from acwm_core.model.shapes import Clip
 
 ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
-
-PANEL = 256
-"""Approximate height of a panel in pixels; frames are magnified by a whole factor."""
 
 FULL_ERROR = 0.5
 """Error (maximum over channels, values in [0, 1]) at which the difference panel saturates."""
@@ -28,8 +26,11 @@ TINT = (0, 168, 150)
 REPORT_PANEL = 128
 """Approximate panel height of videos in reports; the page enlarges them without blur."""
 
+DARK = (13, 14, 22)
+"""Colour of the lines between panels, and of no error."""
+
 _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
-_HEAT_COLOURS = ((13, 14, 22), (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
+_HEAT_COLOURS = (DARK, (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
 
 
 def shown(
@@ -96,8 +97,8 @@ def case_study(
         made.append(tinted(made[1], moving_instances(masks)))
     across = 1 if stacked else 2 if masks.any() else 3
     firsts = range(0, len(made), across)
-    rows = [join(made[first : first + across]) for first in firsts]
-    return [names[first : first + across] for first in firsts], join(rows, axis=1)
+    rows = [join_panels(made[first : first + across]) for first in firsts]
+    return [names[first : first + across] for first in firsts], join_panels(rows, down=True)
 
 
 def moving_instances(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -137,21 +138,6 @@ def panels(truth: Clip, prediction: Clip) -> list[NDArray[np.uint8]]:
     return [true, predicted, heat.round().astype(np.uint8)]
 
 
-def join(panels: Sequence[NDArray[np.uint8]], axis: int = 2) -> NDArray[np.uint8]:
-    """Join panels `[T, H, W, 3]` along `axis`, with dark lines between them."""
-    shape = [*panels[0].shape]
-    shape[axis] = DIVIDER
-    divider = np.full(shape, _HEAT_COLOURS[0], np.uint8)
-    parts = [part for panel in panels for part in (divider, panel)]
-    return np.concatenate(parts[1:], axis)
-
-
-def to_pixels(clip: Clip) -> NDArray[np.uint8]:
-    """A clip `[T, 3, H, W]` in [0, 1] as `[T, H, W, 3]` uint8; NaN is black."""
-    pixels = (clip.detach().cpu().nan_to_num().clamp(0, 1) * 255).round().byte()
-    return pixels.permute(0, 2, 3, 1).contiguous().numpy()
-
-
-def magnification(height: int, panel: int = PANEL) -> int:
-    """The whole factor by which a picture of this height is enlarged to about `panel` pixels."""
-    return max(1, round(panel / height))
+def join_panels(panels: Sequence[Picture], *, down: bool = False) -> Picture:
+    """Join panels, in a row or in a column, with dark lines between them."""
+    return join(panels, down=down, gap=DIVIDER, colour=DARK)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.logger import Logger
 from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto import summary_pb2  # pyright: ignore[reportMissingTypeStubs]
 
+from acwm_core.data.pictures import join, strip, to_pixels
 from acwm_core.model.shapes import Video
 
 STRIP_CLIPS, STRIP_FRAMES = 4, 8
@@ -23,8 +23,9 @@ STRIP_CLIPS, STRIP_FRAMES = 4, 8
 
 def encode_gif(truth: Video, predicted: Video, fps: float) -> bytes:
     """An endlessly looping GIF: one row per clip, truth on the left."""
-    pairs = torch.cat([truth, predicted.to(truth)], dim=-1)
-    first, *others = map(Image.fromarray, _bytes(pairs.permute(1, 0, 3, 4, 2).flatten(1, 2)))
+    pairs = zip(map(to_pixels, truth), map(to_pixels, predicted), strict=True)
+    frames = join([join(pair) for pair in pairs], down=True)
+    first, *others = map(Image.fromarray, frames)
     buffer = io.BytesIO()
     options: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0}
     first.save(buffer, format="GIF", duration=round(1000 / fps), **options)
@@ -36,14 +37,8 @@ def draw_strip(truth: Video, predicted: Video) -> NDArray[np.uint8]:
 
     It shows at most `STRIP_CLIPS` clips and `STRIP_FRAMES` frames of each.
     """
-    frames = truth.shape[1]
-    chosen = np.linspace(0, frames - 1, min(frames, STRIP_FRAMES)).round().astype(int)
-    pairs = torch.stack([truth, predicted.to(truth)], 1)[:STRIP_CLIPS, :, chosen]
-    return _bytes(pairs.permute(0, 1, 4, 2, 5, 3).flatten(3, 4).flatten(0, 2))
-
-
-def _bytes(picture: torch.Tensor) -> NDArray[np.uint8]:
-    return (picture * 255).round().to(torch.uint8).cpu().numpy()
+    pairs = zip(truth[:STRIP_CLIPS], predicted[:STRIP_CLIPS], strict=True)
+    return strip([to_pixels(clip) for pair in pairs for clip in pair], STRIP_FRAMES)
 
 
 @singledispatch

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from acwm_benchmark.videos import Coding, read_video
+from acwm_core.data.pictures import to_pixels
 from acwm_core.data.video import Encoding, encode_frames
 from acwm_core.errors import DataError
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.shapes import Video
 
 KEYFRAMES = 250

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.pictures import to_pixels
 from acwm_core.env.episode import Split
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Goal, Task, judged
@@ -21,7 +22,6 @@ from acwm_core.errors import AcwmWarning, DataError, RecipeError, noting, sugges
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run

@@ -14,6 +14,7 @@ from PIL import Image
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.pictures import moments, strip, to_pixels
 from acwm_core.data.shards import UNREADABLE, from_npy
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import write_mp4
@@ -30,6 +31,7 @@ from acwm_core.errors import (
 from acwm_core.evaluation import videos
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import check_environment, choose_device
+from acwm_core.evaluation.results import DIVIDER
 from acwm_core.files import written_whole
 from acwm_core.model.shapes import Clip, Video, check_pixels
 from acwm_core.model.world_model import Mode
@@ -37,6 +39,9 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_dream.captions import enlarged
+
+COLUMNS = 8
+"""Most frames of a strip."""
 
 SQUEEZED = 0.02
 """A picture whose sides have another ratio than the frames, by so much, is not used silently."""
@@ -178,11 +183,11 @@ def _frames(chunks: Iterator[Video], truth: Clip | None) -> Iterator[Panels]:
                 "a lower training.learning_rate"
             )
         true = None if truth is None else truth[start : start + draws.shape[1]]
-        parts = [videos.to_pixels(clip) for clip in draws]
+        parts = [to_pixels(clip) for clip in draws]
         if true is not None and len(draws) == 1:
             parts = videos.panels(true, draws[0])
         elif true is not None:
-            parts = [videos.to_pixels(true), *parts]
+            parts = [to_pixels(true), *parts]
         yield from zip(*parts, strict=True)
         start += draws.shape[1]
 
@@ -191,10 +196,10 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
     """Write the file; only one chunk of the video is in memory at a time."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
-        joined = (videos.join(frame, axis=0 if card.views else 1) for frame in frames)
+        joined = (videos.join_panels(frame, down=bool(card.views)) for frame in frames)
         write_mp4(out, (enlarged(each, card) for each in joined), card.fps)
     else:
-        numbers = strip_frames(count)
+        numbers = moments(count, COLUMNS)
         selection = [frame for index, frame in enumerate(frames) if index in numbers]
         strip = frame_strip([np.stack(panel) for panel in zip(*selection, strict=True)])
         with written_whole(out) as partial:
@@ -203,14 +208,7 @@ def _write(out: Path, frames: Iterator[Panels], count: int, card: EnvironmentCar
 
 def frame_strip(panels: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """A picture of evenly spaced frames of a clip, with one row per panel `[T, H, W, 3]`."""
-    numbers = strip_frames(len(panels[0]))
-    rows = [videos.join([panel[index] for index in numbers], axis=1) for panel in panels]
-    return videos.join(rows, axis=0)
-
-
-def strip_frames(frames: int) -> list[int]:
-    """Numbers of the frames, out of `frames`, that a frame strip shows."""
-    return np.linspace(0, frames - 1, min(frames, 8)).round().astype(int).tolist()
+    return strip(panels, COLUMNS, gap=DIVIDER, colour=videos.DARK)
 
 
 def _read_episode(

@@ -8,20 +8,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset, Manifest
+from acwm_core.data.pictures import Picture, join
 from acwm_core.data.video import write_mp4
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.files import writable, written_whole
 from acwm_formats.sheets import (
+    GAP,
     Label,
-    Picture,
     action_shares,
-    below,
     contact_sheet,
     legend,
     play_together,
@@ -82,19 +81,21 @@ def preview(
     first = list(_first_episodes(path, card, episodes))
     if not first:
         raise DataError(f"none of the first episodes of {path} can be read: run `acwm data check`")
-    labels, shown = [label for label, _ in first], [episode for _, episode in first]
-    masked = any(each.masks.any() for each in shown)
-    pairs = [[each.video, *([tinted(each.video, each.masks)] * masked)] for each in shown]
-    curves = [action_shares(each.actions, card.environment.action) for each in shown]
+    labels, samples = [label for label, _ in first], [episode for _, episode in first]
+    masked = any(episode.masks.any() for episode in samples)
+    pairs = [
+        [episode.video, *([tinted(episode.video, episode.masks)] * masked)] for episode in samples
+    ]
+    curves = [action_shares(episode.actions, card.environment.action) for episode in samples]
     keys = {"actions:": card.environment.action.names}
     keys |= {"masks:": card.environment.instances[1:]} if masked else {}
     out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "preview.png", out / "preview.mp4"
-    moments = contact_sheet(labels, [np.concatenate(pair, 1) for pair in pairs], columns, curves)
+    moments = contact_sheet(labels, [join(pair, down=True) for pair in pairs], columns, curves)
     with written_whole(sheet) as partial:
         Image.fromarray(_explained(moments, keys)).save(partial, "png")
-    played = play_together(labels, [np.concatenate(pair, 2) for pair in pairs], None, curves)
-    write_mp4(video, (_explained(each, keys) for each in played), fps=card.environment.fps)
+    frames = play_together(labels, [join(pair) for pair in pairs], None, curves)
+    write_mp4(video, (_explained(frame, keys) for frame in frames), fps=card.environment.fps)
     return sheet, video
 
 
@@ -116,7 +117,8 @@ def _first_episodes(
 def _explained(picture: Picture, keys: Mapping[str, Sequence[str]]) -> Picture:
     """The picture, and below it what the colours of actions and masks stand for."""
     width = picture.shape[1]
-    return below([picture, *(legend(title, names, width) for title, names in keys.items())])
+    legends = (legend(title, names, width) for title, names in keys.items())
+    return join([picture, *legends], down=True, gap=GAP)
 
 
 def _describe_split(path: Path, card: DatasetCard, split: Split) -> dict[str, Any]:

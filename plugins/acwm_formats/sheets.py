@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from acwm_core.data.pictures import Picture, enlarge, join, moments
 from acwm_core.env.card import ActionSpec
-
-Picture = NDArray[np.uint8]
-"""``[H, W, 3]`` uint8; a video has a leading axis T."""
 
 GAP = 6
 MIN_SIDE = 144  # pixels; smaller frames are enlarged by repeating pixels
@@ -55,12 +53,11 @@ def contact_sheet(
     columns = max(2, min(columns, (MAX_WIDTH + GAP) // (width + GAP)))
     rows: list[Picture] = []
     for number, (label, video) in enumerate(zip(labels, videos, strict=True)):
-        moments = np.linspace(0, len(video) - 1, min(columns, len(video))).round().astype(int)
-        row = beside([magnified(video[t]) for t in moments])
+        row = join([magnified(video[t]) for t in moments(len(video), columns)], gap=GAP)
         parts = [_strip(_wrapped(label, row.shape[1]), row.shape[1]), row]
-        parts += [drawn_curves(each, row.shape[1]) for each in curves[number : number + 1]]
-        rows.append(below(parts, gap=0))
-    return below(rows)
+        parts += [draw_curves(shares, row.shape[1]) for shares in curves[number : number + 1]]
+        rows.append(join(parts, down=True))
+    return join(rows, down=True, gap=GAP)
 
 
 def play_together(
@@ -83,10 +80,11 @@ def play_together(
         for number, (strip, video) in enumerate(zip(strips, videos, strict=True)):
             now = min(t, len(video) - 1)
             parts = [strip, magnified(video[now])]
-            parts += [drawn_curves(each, width, now) for each in curves[number : number + 1]]
-            cells.append(below(parts, gap=0))
+            parts += [draw_curves(shares, width, now) for shares in curves[number : number + 1]]
+            cells.append(join(parts, down=True))
         cells += [np.full_like(cells[0], 255)] * (-len(cells) % across)
-        yield below([beside(cells[at : at + across]) for at in range(0, len(cells), across)])
+        rows = (cells[first : first + across] for first in range(0, len(cells), across))
+        yield join([join(row, gap=GAP) for row in rows], down=True, gap=GAP)
 
 
 def tinted(video: Picture, masks: NDArray[np.uint8]) -> Picture:
@@ -108,7 +106,7 @@ def action_shares(actions: NDArray[np.floating], spec: ActionSpec) -> NDArray[np
     return shares
 
 
-def drawn_curves(shares: NDArray[np.floating], width: int, now: int | None = None) -> Picture:
+def draw_curves(shares: NDArray[np.floating], width: int, now: int | None = None) -> Picture:
     """The curves of `action_shares` over the episode, with a line at frame `now`."""
     image = Image.new("RGB", (width, CURVES), "white")
     pen = ImageDraw.Draw(image)
@@ -134,25 +132,8 @@ def legend(title: str, names: Sequence[str], width: int) -> Picture:
 
 
 def magnified(frame: Picture) -> Picture:
-    """Enlarge a small frame by drawing each pixel several times."""
-    scale = math.ceil(MIN_SIDE / min(frame.shape[:2]))
-    return frame.repeat(scale, axis=0).repeat(scale, axis=1)
-
-
-def beside(pictures: Sequence[Picture]) -> Picture:
-    """Pictures of equal height in a row."""
-    padded = [np.pad(each, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for each in pictures]
-    return np.concatenate(padded, axis=1)[:, :-GAP]
-
-
-def below(pictures: Sequence[Picture], gap: int = GAP) -> Picture:
-    """Pictures in a column, the narrower ones filled up on the right."""
-    width = max(picture.shape[1] for picture in pictures)
-    padded = [
-        np.pad(each, ((0, gap), (0, width - each.shape[1]), (0, 0)), constant_values=255)
-        for each in pictures
-    ]
-    return np.concatenate(padded)[: -gap or None]
+    """Enlarge small frames by drawing each pixel several times."""
+    return enlarge(frame, math.ceil(MIN_SIDE / min(frame.shape[-3:-1])))
 
 
 TextLine = list[tuple[str, tuple[int, int, int]]]

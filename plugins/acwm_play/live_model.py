@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.data.pictures import to_pixels
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError, noting
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.dataset import Manifest, action_statistics
+from acwm_core.data.pictures import magnification
 from acwm_core.data.readme import write_readme
 from acwm_core.data.shards import shard_name, write_shard
 from acwm_core.data.video import write_mp4
@@ -18,7 +19,7 @@ from acwm_core.env.card import check_episode
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.videos import join, magnification, panels
+from acwm_core.evaluation.videos import join_panels, panels
 from acwm_core.files import held, writing
 from acwm_core.plugins import catalog
 from acwm_play.simulator import TimeStep
@@ -55,7 +56,9 @@ class Recording:
         """The episode, with all data from the simulator."""
         states = [time_step.state for time_step in self.time_steps]
         contacts = [
-            (index, *pair) for index, each in enumerate(self.time_steps) for pair in each.contacts
+            (index, *pair)
+            for index, time_step in enumerate(self.time_steps)
+            for pair in time_step.contacts
         ]
         actions = [time_step.action for time_step in self.time_steps]
         return Episode(
@@ -90,7 +93,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
     true = as_clip(np.stack([time_step.frame for time_step in recording.time_steps]))
     predicted = as_clip(np.stack(recording.model_frames))
     with writing(video):
-        write_mp4(video, join(panels(true, predicted)), card.fps, magnification(height))
+        write_mp4(video, join_panels(panels(true, predicted)), card.fps, magnification(height))
     return folder, index, video
 
 

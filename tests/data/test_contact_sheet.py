@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from acwm_core.data.pictures import join
 from acwm_core.env.card import ActionSpec
 from acwm_formats.sheets import (
     ACCENT,
@@ -11,7 +12,6 @@ from acwm_formats.sheets import (
     MAX_WIDTH,
     Label,
     action_shares,
-    below,
     contact_sheet,
     magnified,
     play_together,
@@ -104,7 +104,7 @@ def test_labels_stand_right_above_their_pictures():
 
 
 def test_rows_of_unequal_width_share_a_page():
-    page = below([np.zeros((4, 10, 3), np.uint8), np.zeros((4, 6, 3), np.uint8)])
+    page = join([np.zeros((4, n, 3), np.uint8) for n in (10, 6)], down=True, gap=GAP)
     assert page.shape == (8 + GAP, 10, 3)
     assert (page[-1, 6:] == 255).all()
 

@@ -7,9 +7,9 @@ import torch
 from PIL import Image
 
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.pictures import to_pixels
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import AcwmWarning, DataError, RecipeError, ShapeError
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import _read_actions, frame_strip, rollout_run
 from acwm_formats.arrays import write_dataset

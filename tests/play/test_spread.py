@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from acwm_core.checks.trial import shaken
-from acwm_core.evaluation.videos import to_pixels
+from acwm_core.data.pictures import to_pixels
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
