@@ -102,13 +102,12 @@ def common_rate(
         The first candidate or usual rate that all of them follow to a quarter of a frame, else the
         one closest to the longest; None if there is none.
     """
-    known = [(rate, seconds) for rate, seconds in measured if rate > 0]
-    if not known:
+    rates = [(rate, seconds) for rate, seconds in measured if rate > 0]
+    if not rates:
         return None
-    rate, seconds = max(known, key=lambda each: each[1] * each[0])
+    rate, seconds = max(rates, key=lambda pair: pair[0] * pair[1])
     whole = Fraction(round(rate)) if round(rate) else Fraction(rate).limit_denominator(1000)
-    usual = [*candidates, whole, whole * Fraction(1000, 1001)]
-    for each in usual:
-        if abs(float(each) / rate - 1) * seconds * rate <= QUARTER:
-            return each
+    for candidate in (*candidates, whole, whole * Fraction(1000, 1001)):
+        if abs(float(candidate) / rate - 1) * seconds * rate <= QUARTER:
+            return candidate
     return Fraction(rate).limit_denominator(1001)

@@ -86,8 +86,8 @@ class FormatChecks(Suite):
             raise NotTried("it is only written")
         for at, recorded in _datasets(self.make().read(**self._example)).items():
             card = _imported(recorded, self._folder / "first" / at)
-            found = check_dataset(self._folder / "first" / at)
-            problems = [str(each) for each in found if each.problem]
+            findings = check_dataset(self._folder / "first" / at)
+            problems = [str(finding) for finding in findings if finding.problem]
             expect(not problems, "; ".join(problems))
             expect("train" in card.splits, "nothing is there to train on")
             again = _datasets(self.make().read(**self._example))[at]
@@ -101,8 +101,8 @@ class FormatChecks(Suite):
             raise NotTried("it is only read")
         files: list[dict[Path, bytes]] = []
         for out in (self._exported, self._export("two")):
-            found = [path for path in sorted(out.rglob("*")) if path.is_file()]
-            files.append({path.relative_to(out): path.read_bytes() for path in found})
+            paths = [path for path in sorted(out.rglob("*")) if path.is_file()]
+            files.append({path.relative_to(out): path.read_bytes() for path in paths})
         expect(any(files[0].values()), "nothing is written")
         expect(files[0] == files[1], "a second export differs")
 
@@ -111,9 +111,9 @@ class FormatChecks(Suite):
         if not (self.target.reads() and self.target.writes()):
             raise NotTried("it is not both read and written")
         expect(self.target.detect(self._exported), "it does not know what it wrote")
-        found = _datasets(self.make().read(self._exported))
-        expect(len(found) == 1, f"it reads {len(found)} datasets")
-        back = _imported(next(iter(found.values())), self._folder / "back")
+        datasets = _datasets(self.make().read(self._exported))
+        expect(len(datasets) == 1, f"it reads {len(datasets)} datasets")
+        back = _imported(next(iter(datasets.values())), self._folder / "back")
         for split in back.splits:
             before, after = (EpisodeDataset(self._folder / f, split) for f in ("waves", "back"))
             expect(before.lengths == after.lengths, f"{split} comes back with {after.lengths}")
@@ -129,7 +129,7 @@ def _read_backwards(recorded: RecordedDataset) -> None:
         copy = pickle.loads(pickle.dumps(recordings))
         for index in reversed(places):
             name = episode_name(split, index)
-            one, other = (_arrays(opened(each, index, name, 1.0)) for each in (recordings, copy))
+            one, other = (_arrays(opened(r, index, name, 1.0)) for r in (recordings, copy))
             same = all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
             expect(same, f"recording {index} of {split} is another when it is read first")
 
@@ -152,11 +152,11 @@ def _waves(seed: int) -> Recording:
     return Recording(video, np.random.default_rng(seed).uniform(-1, 1, (5 + seed, 2)))
 
 
-def _datasets(found: Any) -> dict[str, RecordedDataset]:
-    if isinstance(found, Mapping):
-        return dict(cast(Mapping[str, RecordedDataset], found))
-    expect_is_a(found, RecordedDataset)
-    return {".": found}
+def _datasets(result: Any) -> dict[str, RecordedDataset]:
+    if isinstance(result, Mapping):
+        return dict(cast(Mapping[str, RecordedDataset], result))
+    expect_is_a(result, RecordedDataset)
+    return {".": result}
 
 
 check_format = FormatChecks.check

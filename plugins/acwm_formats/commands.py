@@ -82,7 +82,7 @@ def _print_facts(facts: dict[str, Any]) -> None:
 
     height, width = facts["frame_size"]
     click.echo(f"{facts['path']}: {facts['environment']}, {facts['summary']}")
-    lengths = [n for each in facts["splits"].values() for n in each["lengths"]]
+    lengths = [n for split in facts["splits"].values() for n in split["lengths"]]
     low, high = (min(lengths), max(lengths)) if lengths else (facts["horizon"],) * 2
     long = f"{low}" if low == high else f"{low} to {high}"
     click.echo(f"{height}×{width} at {facts['fps']:.6g} fps, {long} frames per episode")
@@ -97,13 +97,13 @@ def _print_facts(facts: dict[str, Any]) -> None:
             click.echo(f"{facts['exploration']:.0%} of the training episodes are {how}")
     columns = ("episodes", "made", "shards", "frames")
     table = plain_table(None, "split", (*columns, "MB"))
-    for split, each in facts["splits"].items():
-        counts = [str(each[column]) for column in columns]
-        table.add_row(split, *counts, f"{each['bytes'] / 1e6:.1f}")
+    for name, split in facts["splits"].items():
+        counts = [str(split[column]) for column in columns]
+        table.add_row(name, *counts, f"{split['bytes'] / 1e6:.1f}")
     Console(highlight=False, markup=False).print(table)
-    for split, each in facts["splits"].items():
-        for label, count in each.get("ood_labels", {}).items():
-            click.echo(f"{split}: {count} episodes shift {label}")
+    for name, split in facts["splits"].items():
+        for label, count in split.get("ood_labels", {}).items():
+            click.echo(f"{name}: {count} episodes shift {label}")
 
 
 def _print_notes(source: Mapping[str, Any]) -> None:
@@ -129,7 +129,7 @@ class FormatGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The names of the formats that can be read, or written, as far as it is known."""
-        return [each.name for each in _formats() if each.needs or self._can(each.load())]
+        return [f.name for f in _formats() if f.needs or self._can(f.load())]
 
     def _can(self, target: Any) -> bool:
         """Whether a format has the method of this command."""
@@ -138,7 +138,7 @@ class FormatGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List all formats without importing them; their summaries say which are only read."""
         with formatter.section("Formats"):
-            formatter.write_dl([(each.name, each.summary) for each in _formats()])
+            formatter.write_dl([(f.name, f.summary) for f in _formats()])
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put the format first: the one of ``--format``, or the one that the path is in."""
@@ -179,9 +179,9 @@ class FormatGroup(click.Group):
         own = [_parameter(*option) for option in options_of(method)]
 
         def run(**values: Any) -> None:
-            given = {str(each.name): values.pop(str(each.name)) for each in own}
+            options = {str(option.name): values.pop(str(option.name)) for option in own}
             if self._base.callback:
-                self._base.callback(component.create(), given, **values)
+                self._base.callback(component.create(), options, **values)
 
         params = sorted([*own, *self._base.params], key=lambda p: isinstance(p, click.Option))
         text = (inspect.getdoc(method) or "").partition("\nArgs:")[0]
@@ -248,17 +248,17 @@ def import_format(
     from acwm_formats.timeline import RecordedDataset
 
     options = import_options(**asked)
-    found = source.read(**given)
-    several = {".": found} if isinstance(found, RecordedDataset) else found
-    if options.environment and len(several) > 1:
+    recorded = source.read(**given)
+    datasets = {".": recorded} if isinstance(recorded, RecordedDataset) else recorded
+    if options.environment and len(datasets) > 1:
         raise DataError(
-            f"--environment {options.environment} would name {len(several)} datasets alike: import "
-            "one folder at a time, or leave it out"
+            f"--environment {options.environment} would name {len(datasets)} datasets alike: "
+            "import one folder at a time, or leave it out"
         )
-    for name, recorded in several.items():
-        card = import_dataset(recorded, out / name, options, workers=workers)
-        made = ", ".join(f"{count} {split}" for split, count in card.splits.items())
-        click.echo(f"{out / name} holds {made} episodes of {card.environment.name}")
+    for name, dataset in datasets.items():
+        card = import_dataset(dataset, out / name, options, workers=workers)
+        counts = ", ".join(f"{count} {split}" for split, count in card.splits.items())
+        click.echo(f"{out / name} holds {counts} episodes of {card.environment.name}")
         _print_notes(card.source)
         for line in short_form(survey(out / name)):
             click.echo(line)

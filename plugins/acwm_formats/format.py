@@ -109,20 +109,20 @@ def detected_format(path: Path) -> str:
     """
     if not path.exists():
         raise DataError(f"there is no {path}, and no format of that name: see `acwm list format`")
-    found: list[str] = []
+    matches: list[str] = []
     for component in catalog().registry("format"):
         try:
             if component.load().detect(path):
-                found.append(component.name)
+                matches.append(component.name)
         except MissingExtraError:
             continue  # it cannot be read here anyway
-    if len(found) == 1:
-        return found[0]
-    known = ", ".join(found or (each.name for each in catalog().registry("format")))
+    if len(matches) == 1:
+        return matches[0]
+    names = ", ".join(matches or (component.name for component in catalog().registry("format")))
     if path.suffix in ARCHIVES:
         raise DataError(f"{path} is an archive: unpack it, and import the folder that comes out")
-    what = "is in several formats" if found else "is in no format that is known"
-    raise DataError(f"{path} {what}: give --format, one of {known}")
+    what = "is in several formats" if matches else "is in no format that is known"
+    raise DataError(f"{path} {what}: give --format, one of {names}")
 
 
 def export_dataset(
@@ -157,5 +157,5 @@ def options_of(method: Callable[..., Any]) -> list[tuple[inspect.Parameter, str]
     parameters = inspect.signature(method, eval_str=True).parameters.values()
     says = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(method) or "", re.M)
     texts = {name: " ".join(text.split()) for name, text in says}
-    asked = (each for each in parameters if each.name not in ("self", "export"))
-    return [(parameter, texts.get(parameter.name, "")) for parameter in asked]
+    options = (option for option in parameters if option.name not in ("self", "export"))
+    return [(option, texts.get(option.name, "")) for option in options]

@@ -41,7 +41,7 @@ class Labels:
 
     def contacts_of(self, frames: NDArray[np.int64]) -> NDArray[np.int32]:
         """The contacts in some frames, which are numbered by their place among them."""
-        found = [self.contacts[self.contacts[:, 0] == frame] for frame in frames.tolist()]
-        rows = np.concatenate(found).astype(np.int32)
-        rows[:, 0] = np.repeat(np.arange(len(found)), [len(each) for each in found])
+        contacts = [self.contacts[self.contacts[:, 0] == frame] for frame in frames.tolist()]
+        rows = np.concatenate(contacts).astype(np.int32)
+        rows[:, 0] = np.repeat(np.arange(len(contacts)), [len(part) for part in contacts])
         return rows

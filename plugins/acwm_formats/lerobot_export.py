@@ -71,8 +71,8 @@ class Writer:
 
     def __init__(self, root: Path, card: EnvironmentCard) -> None:
         self._root, self._card, self._features = root, card, _features(card)
-        rows = {name: each for name, each in self._features.items() if name != CAMERA}
-        self._schema = arrow.schema([(name, _type(each)) for name, each in rows.items()])
+        rows = {name: entry for name, entry in self._features.items() if name != CAMERA}
+        self._schema = arrow.schema([(name, _type(entry)) for name, entry in rows.items()])
         self._data = _Rolling(root, DATA_PATH, DATA_MB)
         self._videos = _Rolling(root, VIDEO_PATH, VIDEO_MB, video_key=CAMERA)
         self._rows_file: Any = None
@@ -89,9 +89,9 @@ class Writer:
         self._write_rows(columns)
         stats = {name: statistics(rows) for name, rows in columns.items()}
         stats[CAMERA] = colour_statistics(episode.video)
-        for name, each in stats.items():
-            before = self._total.get(name)
-            self._total[name] = combined([before, each]) if before else each
+        for name, part in stats.items():
+            total = self._total.get(name)
+            self._total[name] = combined([total, part]) if total else part
         row: dict[str, Any] = {
             "episode_index": number,
             "tasks": [self._card.summary],
@@ -105,8 +105,9 @@ class Writer:
         row |= {f"videos/{CAMERA}/{key}": value for key, value in self._videos.place.items()}
         row[f"videos/{CAMERA}/from_timestamp"] = start / self._card.fps
         row[f"videos/{CAMERA}/to_timestamp"] = (start + length) / self._card.fps
-        for feature, each in plain({n: stats[n] for n in stats if not n.startswith(OWN)}).items():
-            row |= {f"stats/{feature}/{name}": value for name, value in each.items()}
+        public = {name: part for name, part in stats.items() if not name.startswith(OWN)}
+        for feature, values in plain(public).items():
+            row |= {f"stats/{feature}/{name}": value for name, value in values.items()}
         self.episodes.append(row)
         self._frames += length
 

@@ -68,7 +68,7 @@ def codec_of(entry: Entry) -> str:
 
 def is_key(data: bytes, codec: str) -> bool:
     """Whether a frame can be decoded without those before it."""
-    headers = (found[1][0] for found in START.finditer(data))
+    headers = (match[1][0] for match in START.finditer(data))
     if codec == "h264":
         return any(header & 31 == 5 for header in headers)
     return any(16 <= header >> 1 & 63 <= 21 for header in headers)

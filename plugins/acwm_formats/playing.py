@@ -107,8 +107,8 @@ class Several:
 
     def reset(self, seeds: Sequence[int]) -> Sequence[Any]:
         """As in `Stage`; environments that take one seed for all are given the first."""
-        each = isinstance(self._env.unwrapped, SyncVectorEnv | AsyncVectorEnv)
-        seen, _ = self._env.reset(seed=cast(Any, list(seeds)) if each else seeds[0])
+        several = isinstance(self._env.unwrapped, SyncVectorEnv | AsyncVectorEnv)
+        seen, _ = self._env.reset(seed=cast(Any, list(seeds)) if several else seeds[0])
         self._ended[:] = False
         return self._each(seen)
 
@@ -127,10 +127,13 @@ class Several:
 
     def render(self) -> Sequence[Any]:
         """As in `Stage`."""
-        shown: Any = self._env.render()
-        if not isinstance(shown, list | tuple | np.ndarray) or len(cast(Any, shown)) != self.count:
+        images: Any = self._env.render()
+        if (
+            not isinstance(images, list | tuple | np.ndarray)
+            or len(cast(Any, images)) != self.count
+        ):
             raise DataError(f"its render() returns no frame for each of its {self.count}")
-        return cast(Sequence[Any], shown)
+        return cast(Sequence[Any], images)
 
 
 @dataclass
@@ -161,11 +164,11 @@ class Take:
             self.action = copy.deepcopy(action)  # a policy may reuse its array
         return copy.deepcopy(self.action)  # and so may an environment
 
-    def show(self, observation: Any, shown: Any) -> None:
+    def show(self, observation: Any, image: Any) -> None:
         """Keep what is seen, and the action that led to it."""
         if self.images:
             self.taken.append(_vector(self.space, self.action))
-        self.images.append(_frame(shown))
+        self.images.append(_frame(image))
         self.seen.append(np.array(observation))
 
     def recording(self, space: Any) -> Recording:
@@ -203,14 +206,14 @@ def play(
     """
     takes = list(_takes(stage, policy, specs, frames))
     seen = stage.reset([int(spec.rng("reset").integers(2**31)) for spec in specs])
-    for take, observation, shown in zip(takes, seen, _rendered(stage), strict=True):
-        take.show(observation, shown)
+    for take, observation, image in zip(takes, seen, _rendered(stage), strict=True):
+        take.show(observation, image)
     while not all(take.ended for take in takes):
         actions = [take.act(observation) for take, observation in zip(takes, seen, strict=True)]
         seen, ends = stage.step(actions)
-        for take, observation, end, shown in zip(takes, seen, ends, _rendered(stage), strict=True):
+        for take, observation, end, image in zip(takes, seen, ends, _rendered(stage), strict=True):
             if not take.ended and (stage.shows_last or not end):
-                take.show(observation, shown)
+                take.show(observation, image)
             take.ended |= bool(end) or len(take.images) >= take.limit
     return takes
 
@@ -240,8 +243,8 @@ def _vector(space: Any, action: Any) -> NDArray[np.float32]:
     return np.array(action, np.float32).reshape(-1)
 
 
-def _frame(shown: Any) -> NDArray[np.uint8]:
-    frame = np.array(shown)
+def _frame(image: Any) -> NDArray[np.uint8]:
+    frame = np.array(image)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise DataError("its render() returns no uint8 frame [H, W, 3]")
     return frame

@@ -70,10 +70,10 @@ class Gymnasium(Format):
             envs: How many to step at once, as a vector environment.
         """
         asked = {"policy": policy, "seed": seed, "frames": frames}
-        found = rollouts(Named(env_id, envs), _name(env_id), episodes, policy, seed, frames)
+        dataset = rollouts(Named(env_id, envs), _name(env_id), episodes, policy, seed, frames)
         counts = ",".join(map(str, _counts(episodes).values()))
         facts = {"kind": "gymnasium", "name": env_id, "version": version("gymnasium")}
-        return replace(found, facts=facts, options={"episodes": counts, **asked, "envs": envs})
+        return replace(dataset, facts=facts, options={"episodes": counts, **asked, "envs": envs})
 
     @classmethod
     def example(cls, folder: Path) -> dict[str, Any]:
@@ -110,28 +110,28 @@ def rollouts(
         raise RecipeError(f"--frames {frames}: give at least 2, with an action between them")
     stage = _stage(env)
     _policy(policy)  # which must be there
-    made: dict[Split, Rollouts] = {
+    recordings: dict[Split, Rollouts] = {
         split: Rollouts(env, policy, EpisodeSpec(name, split, seed=seed), frames, count)
         for split, count in counts.items()
         if count
     }
-    if not made:
+    if not recordings:
         raise RecipeError("there are no episodes to make: every split has 0")
     fps = stage.metadata.get("render_fps")
     notes = () if fps else (f"The environment has no render_fps; {FPS} are assumed.",)
     acts = policy if isinstance(policy, str) else getattr(policy, "__name__", "of its owner")
-    shown = env.env_id if isinstance(env, Named) else name
+    title = env.env_id if isinstance(env, Named) else name
     return RecordedDataset(
         name,
-        made,
+        recordings,
         {"kind": "gymnasium", "name": name, "version": version("gymnasium")},
         fps=plain_rate(fps or FPS),
-        actions=_action(shown, stage.action_space),
+        actions=_action(title, stage.action_space),
         notes=notes if stage.shows_last else (*notes, LAST),
         seed=seed,
         costly=True,
         together=stage.count,
-        summary=f"{shown} under the policy {acts}",
+        summary=f"{title} under the policy {acts}",
         engine="Gymnasium",
     )
 
@@ -184,12 +184,12 @@ class Rollouts:
 
 
 @functools.lru_cache(maxsize=1)
-def _played(made: Rollouts, batch: int) -> Sequence[Take]:
+def _played(rollouts: Rollouts, batch: int) -> Sequence[Take]:
     """Rollouts that are played at once."""
-    stage, spec = _stage(made.env), made.spec
+    stage, spec = _stage(rollouts.env), rollouts.spec
     numbers = range(batch * stage.count, (batch + 1) * stage.count)
     specs = [EpisodeSpec(spec.environment, spec.split, index, spec.seed) for index in numbers]
-    return play(stage, _policy(made.policy), specs, made.frames)
+    return play(stage, _policy(rollouts.policy), specs, rollouts.frames)
 
 
 @functools.lru_cache(maxsize=1)
@@ -221,8 +221,8 @@ def _function(env_id: str) -> Callable[[], Any] | None:
     module, colon, name = env_id.partition(":")
     if not colon or not name.isidentifier():
         return None
-    found = getattr(importlib.import_module(module), name, None)
-    return found if callable(found) and name not in gymnasium.registry else None
+    function = getattr(importlib.import_module(module), name, None)
+    return function if callable(function) and name not in gymnasium.registry else None
 
 
 def _made_by(make: Callable[[], Any], named: Named) -> Env | Vector:
@@ -253,16 +253,16 @@ def _policy(policy: str | Policy) -> Policy | None:
         return policy
     with _from_here():
         try:
-            found: object = resolve_name(policy)
+            function: object = resolve_name(policy)
         except (ImportError, AttributeError, ValueError) as error:
             raise RecipeError(
                 f"there is no policy {policy!r} ({error}): give random, or module:function"
             ) from error
-    if not callable(found):
+    if not callable(function):
         raise RecipeError(
             f"the policy {policy} is not a function of an observation and a generator"
         )
-    return found
+    return function
 
 
 def _action(env_id: str, space: Any) -> ActionFacts:

@@ -16,29 +16,31 @@ SMALL, MOST = 64, 96 * 96  # pixels of a side, and of a frame, that the recipe `
 
 
 def target_size(
-    found: tuple[int, int], size: int | tuple[int, int] | None = None
+    original: tuple[int, int], size: int | tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """The frame size ``(H, W)`` of a dataset whose videos have the size `found`.
+    """The frame size ``(H, W)`` of a dataset whose videos have the size `original`.
 
     Args:
-        found: size of the videos.
-        size: the requested size, a side or a pair; by default `found`, each side rounded down to a
-            multiple of 8.
+        original: size of the videos.
+        size: the requested size, a side or a pair; by default `original`, each side rounded down to
+            a multiple of 8.
 
     Raises:
         DataError: the videos are smaller than the requested size, or than 16 pixels.
         ShapeError: a side is not a multiple of 8, or below 16.
     """
-    whole = (found[0] // 8 * 8, found[1] // 8 * 8)
+    whole = (original[0] // 8 * 8, original[1] // 8 * 8)
     if min(whole) < MIN_SIDE:
-        raise DataError(f"frames of {found[0]}×{found[1]} are too small: a side needs {MIN_SIDE}")
-    wanted = resolve_size(size, whole)
-    if wanted[0] > found[0] or wanted[1] > found[1]:
         raise DataError(
-            f"frames of {found[0]}×{found[1]} cannot be enlarged to {wanted[0]}×{wanted[1]}: "
+            f"frames of {original[0]}×{original[1]} are too small: a side needs {MIN_SIDE}"
+        )
+    target = resolve_size(size, whole)
+    if target[0] > original[0] or target[1] > original[1]:
+        raise DataError(
+            f"frames of {original[0]}×{original[1]} cannot be enlarged to {target[0]}×{target[1]}: "
             "give a smaller --size"
         )
-    return wanted
+    return target
 
 
 def small_size(size: tuple[int, int]) -> tuple[int, int]:

@@ -38,8 +38,8 @@ def colour_statistics(video: NDArray[np.uint8]) -> Stats:
     chosen = np.linspace(0, len(video) - 1, min(SHOWN, len(video))).astype(int)
     height, width = video.shape[1:3]
     sample = video[chosen, :: max(1, height // FINE), :: max(1, width // FINE)]
-    found = statistics(sample.reshape(-1, 3) / 255)
-    shaped = {name: value.reshape(3, 1, 1) for name, value in found.items() if name != "count"}
+    stats = statistics(sample.reshape(-1, 3) / 255)
+    shaped = {name: value.reshape(3, 1, 1) for name, value in stats.items() if name != "count"}
     return {**shaped, "count": np.array([len(chosen)])}
 
 
@@ -68,4 +68,4 @@ def combined(parts: list[Stats]) -> Stats:
 
 def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, Any]]:
     """Convert the statistics of features to JSON types."""
-    return {key: {name: v.tolist() for name, v in each.items()} for key, each in stats.items()}
+    return {key: {name: v.tolist() for name, v in part.items()} for key, part in stats.items()}
