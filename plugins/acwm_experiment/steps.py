@@ -23,7 +23,7 @@ from acwm_experiment.plan import ExperimentPlan
 from acwm_experiment.runs import DatasetSpec, RunSpec
 from acwm_experiment.table import EXPERIMENT_FILE, RUN_SUMMARY
 from acwm_experiment.tasks import PlanCommand
-from acwm_planning.jobs import PLAN_SUMMARY
+from acwm_planning.results import PLAN_SUMMARY
 
 _recipe = functools.cache(Recipe.from_yaml)  # the recipe of a run never changes
 

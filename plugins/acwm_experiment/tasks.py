@@ -15,7 +15,8 @@ from acwm_experiment.files import TaskChoice, slug
 from acwm_experiment.names import safe
 from acwm_experiment.runs import RunSpec
 from acwm_experiment.table import Experiment
-from acwm_planning.jobs import PLANS, PlanningJob
+from acwm_planning.jobs import PlanningJob
+from acwm_planning.results import PLANS
 from acwm_planning.settings import settings_of
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import PluginError, RecipeError, check_shape
+from acwm_core.errors import PluginError, check_shape
 from acwm_planning.futures import GoalCost, History
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
+from acwm_planning.scripts import Script
 from acwm_planning.search import SearchPlanner
 
 Actions = Sequence[NDArray[np.float32]]
 """The next raw actions, `[A]` each; at least one."""
-
-
-class NoSolutionError(RecipeError):
-    """A task has no scripted solution."""
 
 
 class Controller(ABC):
@@ -80,27 +77,40 @@ class ScriptedController(Controller):
 
     def __init__(self, *, solves: bool) -> None:
         self._solves = solves
-        self._policy: Policy | None = None
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        rng, action = environment.episode_spec.rng("policy"), environment.card.action
-        self._low, self._high = np.array(action.low), np.array(action.high)
-        self._method = "solution" if self._solves else "policy"
-        self._script_owner = task if self._solves else environment
-        if self._solves:
-            self._policy = task.solution(environment, goal, rng)
-        else:
-            self._policy = environment.policy(rng)
-        if self._policy is None:
-            raise NoSolutionError(f"the task {task.name!r} has no scripted solution")
+        self._action = environment.card.action
+        self._script = Script.begin(environment, task, goal, solves=self._solves)
 
     def act(self, history: History) -> Actions:
         """One action, because the script looks at the simulator before each action."""
-        assert self._policy is not None
-        action = np.asarray(self._policy())
-        check_shape(self._script_owner, self._method, action, len(self._low))
-        check_bounds(self._script_owner, self._method, action, self._low, self._high)
+        script, action = self._script, self._script.act()
+        bounds = np.array(self._action.low), np.array(self._action.high)
+        check_bounds(script.owner, script.method, action, *bounds)
         return [action.astype(np.float32)]
+
+
+class PolicyController(Controller):
+    """Asks a policy that looks at the simulator before each action.
+
+    Args:
+        create: creates the policy of an episode.
+    """
+
+    def __init__(self, create: Callable[[Environment, Task, Goal], Policy]) -> None:
+        self._create = create
+
+    @classmethod
+    def replaying(cls, actions: Iterable[NDArray[np.float32]]) -> PolicyController:
+        """Takes these raw actions, `[A]` each."""
+        return cls(lambda environment, task, goal: iter(actions).__next__)
+
+    def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
+        self._policy = self._create(environment, task, goal)
+
+    def act(self, history: History) -> Actions:
+        """One action."""
+        return [np.asarray(self._policy(), np.float32)]
 
 
 class Rollouts(Protocol):
@@ -131,7 +141,8 @@ class PlanningController(Controller):
         rollouts: predicts the futures of its candidates.
         cost: cost of the futures.
         seed: added to the episode's seed, for the planner's randomness and the model's noise.
-        usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
+        action_std: standard deviation `[A]` of the raw actions that the model was trained on, if
+            known.
 
     Attributes:
         decisions: decisions of the current episode.
@@ -146,10 +157,12 @@ class PlanningController(Controller):
         rollouts: Rollouts,
         cost: Cost,
         seed: int = 0,
-        usual: Sequence[float] | None = None,
+        action_std: Sequence[float] | None = None,
     ) -> None:
         self.rollouts, self._planner, self._cost, self._seed = rollouts, planner, cost, seed
-        self._usual = None if usual is None else torch.tensor(usual, dtype=torch.float32)
+        self._action_std = (
+            None if action_std is None else torch.tensor(action_std, dtype=torch.float32)
+        )
         self.decisions: list[Decision] = []
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
@@ -202,10 +215,10 @@ class PlanningController(Controller):
         if not isinstance(self._planner, SearchPlanner):
             return
         moved = self._absolute and history.actions
-        rest = torch.from_numpy(np.asarray(history.actions[-1] if moved else self.still))
+        still = torch.from_numpy(np.asarray(history.actions[-1] if moved else self.still))
         half = (self._high - self._low) / 2
-        usual = None if self._usual is None else self._usual / half
-        self._planner.search_near((rest - self._low) / half - 1, usual)
+        action_std = None if self._action_std is None else self._action_std / half
+        self._planner.search_near((still - self._low) / half - 1, action_std)
 
     def _valid_actions(self, plan: Plan) -> NDArray[np.float32]:
         """The actions `[T, A]` of a valid plan.

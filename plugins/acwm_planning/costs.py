@@ -25,7 +25,7 @@ def last_frames(length: int, frames: int | None) -> list[int]:
     if frames is not None and frames < 1:
         raise RecipeError(f"cost.frames={frames}: give 1 or more, or null for all")
     count = min(frames or length, length)
-    return [length - 1 - (place * length) // count for place in reversed(range(count))]
+    return [length - 1 - (n * length) // count for n in reversed(range(count))]
 
 
 class LatentDistance(Cost):
@@ -100,19 +100,19 @@ class StateDistance(Cost):
             raise RecipeError("the model predicts no states: set cost.read=pictures")
         return self._judge(futures.observe(frames), len(frames), task, goal)
 
-    def _judge(self, seen: Observation, frames: int, task: Task, goal: Goal) -> Tensor:
-        distances = judged(task, "distance", seen, goal).reshape(-1, frames) / task.tolerance
-        failed = judged(task, "failed", seen, goal).reshape(-1, frames).any(1)
-        known = np.isfinite(distances)
-        if isinstance(seen.states, PredictedStates) and not known.any():
+    def _judge(self, observation: Observation, frames: int, task: Task, goal: Goal) -> Tensor:
+        distances = judged(task, "distance", observation, goal).reshape(-1, frames) / task.tolerance
+        failed = judged(task, "failed", observation, goal).reshape(-1, frames).any(1)
+        finite = np.isfinite(distances)
+        if isinstance(observation.states, PredictedStates) and not finite.any():
             # It may know a field in part, such as where a body is and not how high.
             raise NotPredicted(
-                "of what the model predicts no distance can be told: set cost.read=pictures"
+                "no distance can be computed from what the model predicts: set cost.read=pictures"
             )
-        total = np.where(known, distances, 0).sum(1)
-        mean = total / np.maximum(known.sum(1), 1)
-        mean = np.where(known.any(1), mean, mean.max(initial=0))
-        penalty = self.unknown * (1 - known.mean(1)) + self.failure * failed
+        total = np.where(finite, distances, 0).sum(1)
+        mean = total / np.maximum(finite.sum(1), 1)
+        mean = np.where(finite.any(1), mean, mean.max(initial=0))
+        penalty = self.unknown * (1 - finite.mean(1)) + self.failure * failed
         return torch.from_numpy(mean + penalty).float()
 
 

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from acwm_core.env.environment import Environment, EnvironmentCard, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import noting
+from acwm_core.plugins import catalog
 from acwm_planning.controllers import Controller, Decision, PlanningController
 from acwm_planning.futures import History
 
@@ -58,9 +60,55 @@ class TaskVariant(Task):
         return self._task.solution(environment, goal, rng) if self._steps is None else None
 
 
+def load_task(environment: str, name: str) -> Task:
+    """A task of an environment, by their names."""
+    return catalog().component("environment", environment).load_task(name)
+
+
 def spec_of_seed(card: EnvironmentCard, seed: int) -> EpisodeSpec:
     """The episode of a seed: its number in the test split, on which no model was trained."""
     return EpisodeSpec(card.name, "ind_test", seed, options={"size": card.frame_size})
+
+
+@dataclass(frozen=True)
+class Start:
+    """The start of an episode.
+
+    Attributes:
+        history: the context frames for a model; nothing moves in them.
+        goal: goal of the episode.
+        distance: distance from it.
+    """
+
+    history: History
+    goal: Goal
+    distance: float
+
+    @property
+    def frames(self) -> NDArray[np.uint8]:
+        """The context frames `[K, H, W, 3]`."""
+        return np.stack(self.history.frames)
+
+
+def start_of(
+    environment: TaskEnvironment, spec: EpisodeSpec, *, given: int = 1, goal: Goal | None = None
+) -> Start:
+    """Start an episode, with its own goal or with a given one.
+
+    Args:
+        environment: the environment with its task.
+        spec: spec of the episode.
+        given: number of context frames for a model.
+        goal: the goal; by default the task draws one.
+    """
+    options = {"spec": spec, **({} if goal is None else {"goal": goal})}
+    frame, info = environment.reset(options=options)
+    history = History(spec, [frame])
+    for _ in range(given - 1):
+        history.actions.append(environment.environment.still_action())
+        frame, _, _, _, info = environment.step(history.actions[-1])
+        history.frames.append(frame)
+    return Start(history, environment.goal, float(info["distance"]))
 
 
 @dataclass(frozen=True)
@@ -69,46 +117,79 @@ class EpisodeResult:
 
     history: History
     goal: Goal
-    distances: list[float]  # distance from the goal in every frame
-    success: bool
+    distances: list[float]  # distance from the goal at the start, and after every action
+    successes: list[bool]  # whether the task is solved after every action
     failed: bool
     decisions: list[Decision]  # of a planner; empty for other controllers
+
+    @property
+    def success(self) -> bool:
+        """Whether the task is solved in the end."""
+        return self.successes[-1]
+
+    @property
+    def actions(self) -> NDArray[np.float32]:
+        """The controller's actions `[T, A]`, without those between context frames."""
+        return np.stack(self.history.actions[-len(self.successes) :])
+
+    @property
+    def frames(self) -> NDArray[np.uint8]:
+        """The frame after each of them, `[T, H, W, 3]`."""
+        return np.stack(self.history.frames[-len(self.successes) :])
 
     def facts(self) -> dict[str, Any]:
         """A summary that can be written as JSON."""
         facts: dict[str, Any] = {
             "success": self.success,
             "failed": self.failed,
-            "steps": len(self.history.actions),
+            "steps": len(self.successes),
             "start_distance": self.distances[0],
             "distance": self.distances[-1],
             "decisions": len(self.decisions),
         }
         if self.decisions:
-            facts["seconds_per_decision"] = float(
-                np.mean([each.seconds for each in self.decisions])
-            )
-            evaluations = [each.plan.evaluations for each in self.decisions]
+            seconds = [decision.seconds for decision in self.decisions]
+            evaluations = [decision.plan.evaluations for decision in self.decisions]
+            facts["seconds_per_decision"] = float(np.mean(seconds))
             facts["rollouts_per_decision"] = float(np.mean(evaluations))
         return facts
 
 
-def play(environment: TaskEnvironment, spec: EpisodeSpec, controller: Controller) -> EpisodeResult:
-    """Play an episode until its task is solved or its time is over."""
+def play(
+    environment: TaskEnvironment,
+    spec: EpisodeSpec,
+    controller: Controller,
+    *,
+    steps: int | None = None,
+    given: int = 1,
+    goal: Goal | None = None,
+) -> EpisodeResult:
+    """Play an episode.
+
+    Args:
+        environment: the environment with its task.
+        spec: spec of the episode.
+        controller: chooses the actions.
+        steps: number of actions; by default until the task is solved or its time is over.
+        given: see `start_of`.
+        goal: see `start_of`.
+    """
     parts = environment.environment, environment.task, controller
     with noting(f"in episode {spec.index} of {spec.split}", *parts):
-        frame, info = environment.reset(options={"spec": spec})
-        history, distances = History(spec, [frame]), [info["distance"]]
+        start = start_of(environment, spec, given=given, goal=goal)
+        history, distances, successes = start.history, [start.distance], list[bool]()
         controller.begin(environment.environment, environment.task, environment.goal)
-        over = False
+        over, info = False, dict[str, Any]()
         while not over:
             for action in controller.act(history):
                 frame, _, solved, late, info = environment.step(action)
                 history.frames.append(frame)
                 history.actions.append(action)
                 distances.append(info["distance"])
-                if over := solved or late:
+                successes.append(info["success"])
+                if over := solved or late if steps is None else len(successes) >= steps:
                     break
     decisions = controller.decisions if isinstance(controller, PlanningController) else []
-    solved, failed = bool(info["success"]), bool(info["failed"])
-    return EpisodeResult(history, environment.goal, distances, solved, failed, decisions)
+    return EpisodeResult(
+        history, environment.goal, distances, successes, bool(info["failed"]), decisions
+    )

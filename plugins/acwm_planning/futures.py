@@ -101,24 +101,24 @@ class ModelFutures(Futures):
         self._last, self._estimator, self._stills = last, estimator, stills
         self.length = length
         self._states, self._shapes = states, shapes or {}
-        self._predicted: dict[int, Latent] = {}
-        self._told: Tensor | None = None
+        self._latents: dict[int, Latent] = {}
+        self._predicted_states: Tensor | None = None
 
     @property
     def finite(self) -> Tensor:
         """Which candidates' predictions are finite, `[N]`, in what was asked for."""
-        if self._told is not None and not self._predicted:
-            return _finite_states(self._told)
+        if self._predicted_states is not None and not self._latents:
+            return _finite_states(self._predicted_states)
         self.latents([self.length - 1])
-        seen = torch.stack(list(self._predicted.values()), 1)
-        return seen.detach().isfinite().flatten(1).all(1)
+        latents = torch.stack(list(self._latents.values()), 1)
+        return latents.detach().isfinite().flatten(1).all(1)
 
     def latents(self, frames: Sequence[int]) -> Latent:
         """They carry a gradient if the predicted latents do. Each is predicted once."""
-        missing = [frame for frame in frames if frame not in self._predicted]
+        missing = [frame for frame in frames if frame not in self._latents]
         if missing:
-            self._predicted.update(zip(missing, self._predict(missing).unbind(1), strict=True))
-        return torch.stack([self._predicted[frame] for frame in frames], 1)
+            self._latents.update(zip(missing, self._predict(missing).unbind(1), strict=True))
+        return torch.stack([self._latents[frame] for frame in frames], 1)
 
     @torch.no_grad()
     def video(self, frames: Sequence[int]) -> Video:
@@ -131,20 +131,20 @@ class ModelFutures(Futures):
         with torch.autocast(device, torch.bfloat16, enabled=fast):
             return self._decode(list(frames)).float()
 
-    def _decode(self, chosen: list[int]) -> Video:
+    def _decode(self, frames: list[int]) -> Video:
         stride = self._codec.temporal_stride
-        places = [self._place(frame) for frame in chosen]
+        offsets = [self._offset(frame) for frame in frames]
         if self._codec.memoryless:
-            decode, starts = self._codec.frame_decoder(), range(0, stride * len(chosen), stride)
+            decode, starts = self._codec.frame_decoder(), range(0, stride * len(frames), stride)
             decode(self._given[:1, :1])  # the first latent frame of a video is special
-            video = decode(self.latents(chosen))
+            video = decode(self.latents(frames))
         else:
             later = self.latents(range(-self._past, self.length))
             video = self._codec.decode(torch.cat([self._given, later], 1))
-            starts = [video.shape[1] - stride * (self.length - frame) for frame in chosen]
-        return video[:, [start + place for start, place in zip(starts, places, strict=True)]]
+            starts = [video.shape[1] - stride * (self.length - frame) for frame in frames]
+        return video[:, [start + offset for start, offset in zip(starts, offsets, strict=True)]]
 
-    def _place(self, frame: int) -> int:
+    def _offset(self, frame: int) -> int:
         """Index of a latent frame's last planned video frame within it."""
         return self._last if frame == self.length - 1 else self._codec.temporal_stride - 1
 
@@ -165,16 +165,17 @@ class ModelFutures(Futures):
         """The states of the last video frame of each latent frame, which are predicted once."""
         if self._states is None:
             return None
-        if self._told is None:
-            self._told = self._states()
+        if self._predicted_states is None:
+            self._predicted_states = self._states()
         stride = self._codec.temporal_stride
-        places = [frame * stride + self._place(frame) for frame in frames]
-        return predicted_observation(self._told[:, places].flatten(0, 1).cpu(), self._shapes)
+        video_frames = [frame * stride + self._offset(frame) for frame in frames]
+        states = self._predicted_states[:, video_frames].flatten(0, 1)
+        return predicted_observation(states.cpu(), self._shapes)
 
     def still(self, picture: Frame) -> Latent:
         """Each picture is encoded once per decision."""
-        for known, latent in self._stills:
-            if known is picture:
+        for encoded, latent in self._stills:
+            if encoded is picture:
                 return latent
         latent = still_latent(self._codec, picture, self._given.device)
         self._stills.append((picture, latent))
@@ -184,8 +185,8 @@ class ModelFutures(Futures):
 def _finite_states(states: Tensor) -> Tensor:
     """For which clips, `[N]`, states `[N, T, S]` are finite that the model knows of any of them."""
     finite = states.isfinite()
-    known = finite.any(1).any(0)
-    return finite[..., known].flatten(1).all(1) & known.any()
+    predicted = finite.any(1).any(0)
+    return finite[..., predicted].flatten(1).all(1) & predicted.any()
 
 
 class _Given(NamedTuple):
@@ -270,15 +271,15 @@ class ModelRollouts:
 
     def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
         world = self.world_model
-        known, stride = world.context_frames, world.codec.temporal_stride
+        context, stride = world.context_frames, world.codec.temporal_stride
         past = min(self._past, len(history.actions) // stride) * stride
-        before = max(0, known - 1 - (len(history.actions) - past))  # frames before the start
-        frames = [history.frames[0]] * before + history.frames
-        actions = [still] * before + history.actions
-        first = len(frames) - past - known
+        padding = max(0, context - 1 - (len(history.actions) - past))  # frames before the start
+        frames = [history.frames[0]] * padding + history.frames
+        actions = [still] * padding + history.actions
+        first = len(frames) - past - context
         device = world.action_low.device
-        video = as_clip(np.stack(frames[first : first + known]))[None].to(device)
-        recent = np.array(actions[first:], np.float32).reshape(1, known - 1 + past, len(still))
+        video = as_clip(np.stack(frames[first : first + context]))[None].to(device)
+        recent = np.array(actions[first:], np.float32).reshape(1, context - 1 + past, len(still))
         codec = world.codec.with_reference(video[:, -1])
         return _Given(codec, world.encode(video), torch.from_numpy(recent))
 
@@ -289,12 +290,12 @@ class ModelRollouts:
         seed: int,
         stills: list[tuple[Frame, Latent]],
     ) -> ModelFutures:
-        codec, stride, known = given.codec, given.codec.temporal_stride, given.latents.shape[1]
-        past = codec.latent_frames(given.frames) - known
+        codec, stride, context = given.codec, given.codec.temporal_stride, given.latents.shape[1]
+        past = codec.latent_frames(given.frames) - context
         length, last = -(-actions.shape[1] // stride), (actions.shape[1] - 1) % stride
 
         def predict(frames: Sequence[int]) -> Latent:
-            numbers = [known + past + frame for frame in frames]
+            numbers = [context + past + frame for frame in frames]
             with torch.set_grad_enabled(actions.requires_grad):
                 return self._predict(given, actions, seed, numbers)
 

@@ -11,12 +11,7 @@ from typing import Any
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
-
-PLANS = "planning"
-"""Folder within a run folder, or an experiment's, with a folder of results for each task."""
-
-PLAN_SUMMARY = "summary.json"
-"""File that `acwm plan` writes after every episode into a folder of results."""
+from acwm_planning.results import PLAN_SUMMARY
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import RecipeError
 from acwm_core.files import writing, written_whole
 from acwm_planning.controllers import PlanningController, ScriptedController
-from acwm_planning.episode import spec_of_seed
+from acwm_planning.episode import play, spec_of_seed, start_of
 from acwm_planning.futures import GoalCost, History
 from acwm_planning.run import EpisodePlayer, make_cost, make_planner
 
@@ -70,9 +70,9 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
         assert isinstance(controller, PlanningController)
         cost = controller.rollouts.cost(history, still, goal_cost, seed)
         with torch.no_grad():
-            found = cost(torch.from_numpy(candidates)).double().numpy()
-        costs[judge] = found[:-1].reshape(SIDE, SIDE)
-        ranks[judge] = float(np.mean(found[:-1] < found[-1]))
+            values = cost(torch.from_numpy(candidates)).double().numpy()
+        costs[judge] = values[:-1].reshape(SIDE, SIDE)
+        ranks[judge] = float(np.mean(values[:-1] < values[-1]))
     means = true.mean(0)
     return Landscape(chosen, places, (means[chosen[0]], means[chosen[1]]), costs, ranks)
 
@@ -83,21 +83,14 @@ def _solved_so_far(
     """The history up to the moment, the solution's next actions `[T, A]`, and the still action."""
     environment, planner = player.environment, make_planner(player.settings)
     spec = spec_of_seed(player.card, seed)
-    frame, _ = environment.reset(options={"spec": spec})
-    still, history = environment.environment.still_action(), History(spec, [frame])
-    script = ScriptedController(solves=True)
-    script.begin(environment.environment, environment.task, environment.goal)
+    start_of(environment, spec)
+    still = environment.environment.still_action()
     ahead = getattr(planner, "horizon", 1) * getattr(planner, "action_block", 1)
-    planned: list[NDArray[np.float32]] = []
-    for step in range(MOMENT + max(ahead, planner.actions_per_plan)):
-        (action,) = script.act(history)
-        frame, *_ = environment.step(action)
-        if step < MOMENT:
-            history.frames.append(frame)
-            history.actions.append(action)
-        else:
-            planned.append(action)
-    return history, np.stack(planned), still
+    steps = MOMENT + max(ahead, planner.actions_per_plan)
+    solution = play(environment, spec, ScriptedController(solves=True), steps=steps)
+    frames = solution.history.frames[: MOMENT + 1]
+    history = History(spec, frames, solution.history.actions[:MOMENT])
+    return history, solution.actions[MOMENT:], still
 
 
 def _candidates(
@@ -118,22 +111,22 @@ def _candidates(
     return np.stack([*plans, true]), (first, second), places
 
 
-def draw(found: Landscape, spec: ActionSpec, path: Path) -> Path:
+def draw(shape: Landscape, spec: ActionSpec, path: Path) -> Path:
     """Draw the landscapes side by side as a PNG, with the true action and each one's cheapest."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.4), layout="constrained")
     axes = figure.subplots(1, len(JUDGES), sharex=True, sharey=True)
-    rows, columns = found.places
-    down, across = (f"{spec.names[i]} ({spec.units[i]})".removesuffix(" ()") for i in found.actions)
+    rows, columns = shape.places
+    down, across = (f"{spec.names[i]} ({spec.units[i]})".removesuffix(" ()") for i in shape.actions)
     for axis, judge in zip(axes, JUDGES, strict=True):
-        costs = found.costs[judge]
-        shown = axis.contourf(columns, rows, costs, 24, cmap="viridis_r")
-        figure.colorbar(shown, ax=axis, label="cost")
+        costs = shape.costs[judge]
+        contours = axis.contourf(columns, rows, costs, 24, cmap="viridis_r")
+        figure.colorbar(contours, ax=axis, label="cost")
         best = np.unravel_index(np.nanargmin(costs), costs.shape)
         axis.plot(columns[best[1]], rows[best[0]], "x", color="white", ms=9, mew=2)
-        axis.plot(found.true[1], found.true[0], "o", mfc="none", color="red", ms=12, mew=2)
-        axis.set(title=f"{judge}: {found.ranks[judge]:.1%} cheaper than the true one")
+        axis.plot(shape.true[1], shape.true[0], "o", mfc="none", color="red", ms=12, mew=2)
+        axis.set(title=f"{judge}: {shape.ranks[judge]:.1%} cheaper than the true one")
         axis.set(xlabel=across)
     axes[0].set(ylabel=down)
     figure.suptitle("Cost of plans by their mean action: ○ the true one, × the cheapest here")

@@ -11,7 +11,7 @@ from typing import Any
 from acwm_core.env.task import SolvedAtStartError
 from acwm_core.errors import AcwmWarning, RecipeError, is_for_users, sentence
 from acwm_core.files import disk_error
-from acwm_planning.controllers import NoSolutionError
+from acwm_planning.scripts import NoSolutionError
 
 
 def _is_shared(error: Exception) -> bool:
@@ -21,7 +21,7 @@ def _is_shared(error: Exception) -> bool:
 
 @contextlib.contextmanager
 def passed_over() -> Generator[None]:
-    """Pass over an episode that fails in the block, which will be told where it counts."""
+    """Pass over an episode that fails in the block; it is reported where it counts."""
     try:
         yield
     except SolvedAtStartError:
@@ -49,7 +49,7 @@ class LeftOut:
 
     @contextlib.contextmanager
     def trying(self, row: str, seed: int) -> Generator[None]:
-        """Leave out an episode that fails in the block, and tell it.
+        """Leave out an episode that fails in the block, and warn of it.
 
         Errors of settings and of the disk, which all episodes share, are raised.
         """
@@ -60,19 +60,19 @@ class LeftOut:
             self.error = self.error or error
         except SolvedAtStartError as error:
             self.solved.add(seed)
-            self._tell(f"{error}: it is left out", error)
+            self._warn(f"{error}: it is left out", error)
         except Exception as error:
             if _is_shared(error):
                 raise
             self.failed[row, seed] = sentence(error)
-            self._tell(f"{row} with seed {seed} is left out: {sentence(error)}", error)
+            self._warn(f"{row} with seed {seed} is left out: {sentence(error)}", error)
 
-    def _tell(self, message: str, error: Exception) -> None:
+    def _warn(self, message: str, error: Exception) -> None:
         self.error = self.error or error
         warnings.warn(message, AcwmWarning, stacklevel=4)
 
     def facts(self) -> dict[str, Any]:
         """It as JSON types."""
-        failed = [[*place, why] for place, why in self.failed.items()]
+        failed = [[*episode, why] for episode, why in self.failed.items()]
         facts = {"left_out": sorted(self.rows), "solved_at_start": sorted(self.solved)}
         return {**facts, "failed": failed} if failed else facts

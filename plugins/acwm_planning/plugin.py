@@ -1,4 +1,4 @@
-"""Registers the kinds planner and cost, some of each, `acwm plan` and `acwm rank`."""
+"""Registers the kinds planner and cost, and some of each."""
 
 from acwm_core.plugins import Registry, hookimpl
 
@@ -65,21 +65,4 @@ def register_costs(registry: Registry) -> None:
         "callable",
         "acwm_planning.costs:UserCost",
         summary="a function of yours: cost.function=module:name",
-    )
-
-
-@hookimpl
-def register_commands(registry: Registry) -> None:
-    """Add the commands."""
-    registry.add(
-        "plan",
-        "acwm_planning.commands:plan",
-        summary="act by planning with a model, in the simulator",
-        after="evaluate",
-    )
-    registry.add(
-        "rank",
-        "acwm_planning.policies.commands:rank",
-        summary="rank policies in a model, and compare with the simulator",
-        after="plan",
     )

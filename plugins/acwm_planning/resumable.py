@@ -50,8 +50,8 @@ class ResumableResults:
     def finished(self) -> list[Line]:
         """The results of all finished episodes.
 
-        Lines that are damaged are told and left out, so that their episodes are played again, as
-        are those of lines that a killed command wrote only in part.
+        Damaged lines are reported and left out, so that their episodes are played again, as are
+        those of lines that a killed command wrote only in part.
         """
         path, lines, damaged = self.folder / EPISODES_FILE, dict[tuple[str, int], Line](), 0
         content = path.read_bytes() if path.exists() else b""
@@ -63,8 +63,8 @@ class ResumableResults:
             except (ValueError, LookupError, TypeError):
                 damaged += text.endswith((b"}", b"]"))
         if damaged:
-            told = f"{path} has damaged lines ({damaged}): their episodes are played again"
-            warnings.warn(told, AcwmWarning, stacklevel=2)
+            message = f"{path} has damaged lines ({damaged}): their episodes are played again"
+            warnings.warn(message, AcwmWarning, stacklevel=2)
         return list(lines.values())
 
     @contextlib.contextmanager

@@ -1,9 +1,9 @@
-"""Plays the episodes of a run and a task, and writes videos and a table."""
+"""Plays the episodes of `acwm plan`, and writes videos and a table."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import Environment
-from acwm_core.env.task import Task, TaskEnvironment
+from acwm_core.env.task import TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import duration
@@ -26,22 +26,23 @@ from acwm_planning.controllers import (
     ScriptedController,
     StillController,
 )
-from acwm_planning.episode import EpisodeResult, TaskVariant, play, spec_of_seed
-from acwm_planning.futures import History, ModelRollouts
-from acwm_planning.left_out import LeftOut, passed_over
-from acwm_planning.page import write_page
+from acwm_planning.episode import (
+    EpisodeResult,
+    TaskVariant,
+    load_task,
+    play,
+    spec_of_seed,
+    start_of,
+)
+from acwm_planning.futures import ModelRollouts
+from acwm_planning.left_out import passed_over
 from acwm_planning.planner import Cost, Planner
+from acwm_planning.results import VIDEOS, PlanTable
 from acwm_planning.resumable import Line, ResumableResults
+from acwm_planning.runner import EpisodeTable, play_missing
 from acwm_planning.settings import Settings
 from acwm_planning.simulator import SimulatorRollouts
-from acwm_planning.table import (
-    VIDEOS,
-    EpisodeLine,
-    RowSummary,
-    missing_episodes,
-    summarise,
-    write_summary,
-)
+from acwm_planning.table import EpisodeLine, summarise, write_summary
 from acwm_planning.video import draw_curves, imagine, write_episode
 
 PLANNED_ROWS = ("model", "simulator", "codec")
@@ -55,7 +56,7 @@ class EpisodePlayer:
         task: name of a task of its environment.
         settings: settings of planning.
         device: device of the model; ``"auto"`` takes a GPU if there is one.
-        usual: see `PlanningController`.
+        action_std: see `PlanningController`.
     """
 
     def __init__(
@@ -64,12 +65,11 @@ class EpisodePlayer:
         task: str,
         settings: Settings,
         device: str = "auto",
-        usual: Sequence[float] | None = None,
+        action_std: Sequence[float] | None = None,
     ) -> None:
-        self.card, self.settings, self._usual = bundle.card, settings, usual
+        self.card, self.settings, self._action_std = bundle.card, settings, action_std
         self._world = bundle.world_model.to(choose_device(device))
-        component = catalog().component("environment", self.card.name)
-        goal_task: Task = component.load_task(task)
+        goal_task = load_task(self.card.name, task)
         steps, limit = settings.goal_ahead, settings.max_steps
         if steps is not None or limit is not None:
             goal_task = TaskVariant(goal_task, steps=steps, max_steps=limit)
@@ -92,31 +92,24 @@ class EpisodePlayer:
         if row in ("policy", "solution"):
             return ScriptedController(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulator_rollouts(row == "codec")
-        return PlanningController(planner, rollouts, make_cost(self.settings), usual=self._usual)
+        cost = make_cost(self.settings)
+        return PlanningController(planner, rollouts, cost, action_std=self._action_std)
 
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
         return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
 
-    def estimate(self, episodes: Sequence[tuple[str, int]]) -> str:
-        """How long it takes at most to play these, rows and seeds, from a decision of each planner.
-
-        Episodes that are solved end earlier, and those without a planner take little. It is empty
-        if no planner decides anything.
-        """
-        counts = Counter(row for row, _ in episodes if row in PLANNED_ROWS)
-        spec, seconds = spec_of_seed(self.card, episodes[0][1]), 0.0
-        for row, count in counts.items():
-            controller = self.controller(row)
-            assert isinstance(controller, PlanningController)
-            with passed_over():
-                frame, _ = self.environment.reset(options={"spec": spec})
-                parts = self.environment.environment, self.environment.task
-                controller.begin(*parts, self.environment.goal)
-                taken = len(controller.act(History(spec, [frame])))
-                decisions = -(-self.environment.task.max_steps // taken)
-                seconds += count * decisions * controller.decisions[0].seconds
-        return f"at most about {duration(seconds)} for {len(episodes)} episodes" if seconds else ""
+    def seconds(self, row: str, seed: int) -> float:
+        """How long an episode takes at most, from a first decision; 0 without a planner."""
+        if row not in PLANNED_ROWS:
+            return 0.0
+        controller, spec = self.controller(row), spec_of_seed(self.card, seed)
+        assert isinstance(controller, PlanningController)
+        start = start_of(self.environment, spec)
+        controller.begin(self.environment.environment, self.environment.task, start.goal)
+        actions = controller.act(start.history)
+        decisions = -(-self.environment.task.max_steps // len(actions))
+        return decisions * controller.decisions[0].seconds
 
     def write_video(
         self, folder: Path, row: str, seed: int, result: EpisodeResult, controller: Controller
@@ -135,9 +128,9 @@ class EpisodePlayer:
 
     def close(self) -> None:
         """Close the environments."""
-        for each in (self.environment, self._branches):
-            if each is not None:
-                each.close()
+        for environment in (self.environment, self._branches):
+            if environment is not None:
+                environment.close()
 
     def _simulator_rollouts(self, coded: bool) -> SimulatorRollouts:
         if self._branches is None:
@@ -168,13 +161,54 @@ def _create(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
 def declared_settings(run: str | Path, task: str) -> tuple[str, ...]:
     """The settings that a task of a run's environment declares; see `Task.planning`."""
     name = DatasetCard.read(RunFolder(find_run(run)).card).environment.name
-    return catalog().component("environment", name).load_task(task).planning
+    return load_task(name, task).planning
 
 
-def usual_actions(run: Path) -> list[float] | None:
+def action_std_of(run: Path) -> list[float] | None:
     """Standard deviation `[A]` of the raw actions that a model was trained on; None if unknown."""
     statistics = DatasetCard.read(RunFolder(run).card).actions.get("train")
     return None if statistics is None else [*statistics["std"]]
+
+
+class PlannedEpisodes(EpisodeTable):
+    """Episodes of a task, with a row for each way to act.
+
+    Args:
+        player: plays them.
+        rows: of `ROW_NAMES`.
+        videos: folder of the videos.
+        filmed: seeds that get a video.
+    """
+
+    def __init__(
+        self, player: EpisodePlayer, rows: Sequence[str], videos: Path, filmed: Sequence[int]
+    ) -> None:
+        super().__init__(rows)
+        self._player, self._videos, self._filmed = player, videos, filmed
+
+    def lines(self, seed: int, rows: Sequence[str]) -> Iterator[Line]:
+        for row in rows:
+            if row in self.left.rows or seed in self.left.solved:
+                continue
+            line: Line = {}
+            with self.left.trying(row, seed):
+                result, controller = self._player.play(row, seed)
+                if seed in self._filmed:
+                    self._player.write_video(self._videos, row, seed, result, controller)
+                line = {"row": row, "seed": seed, **result.facts()}
+            if line:
+                yield line
+
+    def estimate(self, missing: Mapping[int, Sequence[str]]) -> str:
+        """Episodes that are solved end earlier, and those without a planner take little."""
+        counts = Counter(row for rows in missing.values() for row in rows)
+        if counts.total() < 2:
+            return ""
+        seconds = 0.0
+        for row, count in counts.items():
+            with passed_over():
+                seconds += count * self._player.seconds(row, next(iter(missing)))
+        return f"at most about {duration(seconds)} for {counts.total()} episodes" if seconds else ""
 
 
 def plan_episodes(
@@ -188,8 +222,8 @@ def plan_episodes(
     videos: int = 3,
     device: str = "auto",
     report: Callable[[Line], None] = lambda line: None,
-    tell: Callable[[str], None] = lambda text: None,
-) -> list[RowSummary]:
+    progress: bool = False,
+) -> PlanTable:
     """Play the episodes that are missing in `out`, and write the table of all episodes.
 
     Args:
@@ -201,14 +235,14 @@ def plan_episodes(
         out: the results folder. Episodes that it already holds are not played again.
         videos: number of seeds, from the first, that get a video.
         device: device of the model.
-        report: called with the result of every episode.
-        tell: called with an estimate of how long it takes, before it starts.
+        report: called with the result of every episode, after the table is written.
+        progress: show an estimate of the time, and a progress bar.
 
     Returns:
         The table of all episodes in `out`.
     """
     weights = RunFolder(run).weights
-    player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))
+    player = EpisodePlayer(load_run(run), task, settings, device, action_std_of(run))
     goal_task, digest = player.environment.task, read_metadata(weights).get("sha256")
     identity = {"environment": player.card.name, "task": task, "weights": digest}
     # reports recognise the weights by the file's hash
@@ -218,35 +252,19 @@ def plan_episodes(
         "file_sha256": file_sha256(weights),
     }
     results = ResumableResults(out, {**identity, **settings.to_dict()}, kind=EpisodeLine)
-    left = LeftOut()
+    table = PlannedEpisodes(player, rows, out / VIDEOS, seeds[:videos])
+
+    def write(line: Line | None = None) -> None:
+        rows = [asdict(row) for row in summarise(results.finished())]
+        write_summary(out, {**results.settings, **facts, **table.left.facts(), "rows": rows})
+        if line is not None:
+            report(line)
+
+    label = f"planning {task}" if progress else ""
     try:
         with results.adding():
-            missing = [*missing_episodes(rows, seeds, results.finished())]
-            if len(missing) > 1 and (about := player.estimate(missing)):
-                tell(about)
-            for row, seed in missing:
-                if row in left.rows or seed in left.solved:
-                    continue
-                with left.trying(row, seed):
-                    result, controller = player.play(row, seed)
-                    if seed in seeds[:videos]:
-                        player.write_video(out / VIDEOS, row, seed, result, controller)
-                    line = {"row": row, "seed": seed, **result.facts()}
-                    results.add(line)
-                    _write_table(results, {**facts, **left.facts()})
-                    report(line)
-            if left.error and not results.finished():
-                raise left.error
-            return _write_table(results, {**facts, **left.facts()})
+            play_missing(table, results, seeds, report=write, progress=label)
+            write()
+            return PlanTable.read(out)
     finally:
         player.close()
-
-
-def _write_table(results: ResumableResults, facts: Mapping[str, Any]) -> list[RowSummary]:
-    """Write the table and the page of the results so far; `facts` are added to the table's file."""
-    table = summarise(results.finished())
-    about = results.settings
-    write_page(results.folder, f"{about['task']} in {about['environment']}", about, table)
-    rows = [asdict(each) for each in table]
-    write_summary(results.folder, {**about, **facts, "rows": rows})
-    return table

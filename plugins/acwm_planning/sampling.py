@@ -81,37 +81,37 @@ class CrossEntropy(SearchPlanner):
 
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
         """Draw candidates and fit the Gaussian, in turn."""
-        mean, deviation = start, self.deviation(self.spread, SPREAD, start)
-        kept = self.kept_elites(start)
+        mean, std = start, self.initial_std(self.spread, SPREAD, start)
+        kept = self.previous_elites(start)
         for iteration in range(self.iterations):
-            noise = self.noise((self.drawn(iteration), *start.shape), rng)
-            groups = [(mean + deviation * noise).clamp(-1, 1), kept]
+            noise = self.noise((self.population(iteration), *start.shape), rng)
+            groups = [(mean + std * noise).clamp(-1, 1), kept]
             if iteration == self.iterations - 1:
                 groups.append(mean[None])
             candidates = torch.cat(groups)
             costs = search(candidates)
-            best = candidates[costs.argsort(stable=True)[: self.elites]]
+            elites = candidates[costs.argsort(stable=True)[: self.elites]]
             # Candidates without a finite cost are not used for the fit.
-            best = best[: max(2, int(costs.isfinite().sum()))]
-            mean = torch.lerp(best.mean(0), mean, self.momentum)
-            deviation = torch.lerp(best.std(0), deviation, self.momentum)
-            kept = self.keep(best)
+            elites = elites[: max(2, int(costs.isfinite().sum()))]
+            mean = torch.lerp(elites.mean(0), mean, self.momentum)
+            std = torch.lerp(elites.std(0), std, self.momentum)
+            kept = self.keep(elites)
 
-    def drawn(self, iteration: int) -> int:
-        """Number of candidates drawn in an iteration."""
+    def population(self, iteration: int) -> int:
+        """Number of new candidates in an iteration."""
         return self.candidates
 
     def noise(self, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
         """Noise with unit variance, `[N, H, A]`."""
         return torch.randn(shape, generator=rng)
 
-    def kept_elites(self, start: Tensor) -> Tensor:
+    def previous_elites(self, start: Tensor) -> Tensor:
         """Elites of the previous decision, `[K, H, A]`; none here."""
         return start.new_zeros(0, *start.shape)
 
-    def keep(self, best: Tensor) -> Tensor:
+    def keep(self, elites: Tensor) -> Tensor:
         """Which of the elites `[E, H, A]` stay candidates in the next iteration; none here."""
-        return best[:0]
+        return elites[:0]
 
 
 class ImprovedCrossEntropy(CrossEntropy):
@@ -167,8 +167,8 @@ class ImprovedCrossEntropy(CrossEntropy):
         super().reset()
         self._elites = None
 
-    def drawn(self, iteration: int) -> int:
-        """Number of candidates; it falls with each iteration."""
+    def population(self, iteration: int) -> int:
+        """Number of new candidates; it falls with each iteration."""
         return min(
             self.candidates, max(2 * self.elites, int(self.candidates / self.decay**iteration))
         )
@@ -177,15 +177,15 @@ class ImprovedCrossEntropy(CrossEntropy):
         """Coloured noise."""
         return coloured_noise(shape, self.colour, rng)
 
-    def kept_elites(self, start: Tensor) -> Tensor:
+    def previous_elites(self, start: Tensor) -> Tensor:
         """Elites of the previous decision, shifted in time."""
         if not self.warm_start or self._elites is None:
-            return super().kept_elites(start)
+            return super().previous_elites(start)
         return self.shifted(self._elites)
 
-    def keep(self, best: Tensor) -> Tensor:
+    def keep(self, elites: Tensor) -> Tensor:
         """The best share of the elites."""
-        self._elites = best[: math.ceil(self.kept * len(best))]
+        self._elites = elites[: math.ceil(self.kept * len(elites))]
         return self._elites
 
 
@@ -238,11 +238,11 @@ class PathIntegral(SearchPlanner):
 
 def path_weights(costs: Tensor, temperature: float) -> Tensor:
     """Weights `[N]` of candidates, with sum 1; candidates with infinite cost get weight 0."""
-    known = costs.isfinite()
-    if not known.any():
+    finite = costs.isfinite()
+    if not finite.any():
         return torch.full_like(costs, 1 / len(costs))
-    scale = temperature * costs[known].std(correction=0).clamp(min=1e-12)
-    return torch.softmax(torch.where(known, -(costs - costs[known].min()) / scale, -math.inf), 0)
+    scale = temperature * costs[finite].std(correction=0).clamp(min=1e-12)
+    return torch.softmax(torch.where(finite, -(costs - costs[finite].min()) / scale, -math.inf), 0)
 
 
 def coloured_noise(shape: tuple[int, ...], colour: float, rng: torch.Generator) -> Tensor:

@@ -13,8 +13,8 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.shapes import Actions
 from acwm_planning.planner import Plan, Planner, RolloutCost
 
-LEAST = 0.02
-"""Smallest standard deviation of `SearchPlanner.usual`, for actions scaled to [-1, 1]."""
+MIN_ACTION_STD = 0.02
+"""Smallest value of `SearchPlanner.action_std`, for actions scaled to [-1, 1]."""
 
 
 class Search:
@@ -24,12 +24,12 @@ class Search:
         cost: maps raw actions `[N, T, A]` to costs `[N]`.
         low, high: bounds `[A]` of raw actions; they correspond to -1 and 1.
         action_block: number of actions of each block.
-        before: the action `[A]` in [-1, 1] from which the first block leads to its own, and each
-            later one from that of the block before, in equal steps. None if blocks repeat theirs.
+        previous: the action `[A]` in [-1, 1] from which the first block leads to its own, and each
+            later one from that of its predecessor, in equal steps. None if blocks repeat theirs.
 
     Attributes:
         best: the cheapest blocks so far, `[H, A]`; None as long as no candidate has a finite cost.
-        least: the cost of `best`.
+        best_cost: the cost of `best`.
         evaluations: number of candidates evaluated so far.
     """
 
@@ -39,12 +39,12 @@ class Search:
         low: Tensor,
         high: Tensor,
         action_block: int,
-        before: Tensor | None = None,
+        previous: Tensor | None = None,
     ) -> None:
         self._cost, self._low, self._high, self._block = cost, low, high, action_block
-        self._before = before
+        self._previous = previous
         self.best: Tensor | None = None
-        self.least, self.evaluations = math.inf, 0
+        self.best_cost, self.evaluations = math.inf, 0
 
     def __call__(self, blocks: Tensor) -> Tensor:
         """Evaluate blocks; returns costs `[N]`. NaN becomes infinite, so that it is never the best.
@@ -58,16 +58,16 @@ class Search:
         costs = torch.where(costs.isnan(), math.inf, costs)
         self.evaluations += len(blocks)
         cheapest = int(costs.argmin())
-        least = float(costs[cheapest].detach())
-        if least < self.least:
-            self.least, self.best = least, blocks[cheapest].detach().clone()
+        cost = float(costs[cheapest].detach())
+        if cost < self.best_cost:
+            self.best_cost, self.best = cost, blocks[cheapest].detach().clone()
         return costs
 
     def actions(self, blocks: Tensor) -> Actions:
         """Raw actions `[N, T, A]`, clipped so that rounding cannot push them out of bounds."""
         scaled = blocks.clamp(-1, 1).repeat_interleave(self._block, 1)
-        if self._before is not None:
-            first = self._before.to(blocks).expand(len(blocks), self._block, -1)
+        if self._previous is not None:
+            first = self._previous.to(blocks).expand(len(blocks), self._block, -1)
             earlier = torch.cat([first, scaled[:, : -self._block]], 1)
             share = (torch.arange(scaled.shape[1]) % self._block + 1) / self._block
             scaled = earlier + share[:, None] * (scaled - earlier)
@@ -113,27 +113,27 @@ class SearchPlanner(Planner):
         self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, count
         self.interpolation, self.warm_start = interpolation, warm_start
         self._last: Tensor | None = None
-        self._rest: Tensor | None = None
-        self.usual: Tensor | None = None
+        self._still: Tensor | None = None
+        self.action_std: Tensor | None = None
 
     def reset(self) -> None:
         """Forget the last plan."""
         self._last = None
 
-    def search_near(self, rest: Tensor, usual: Tensor | None) -> None:
+    def search_near(self, still: Tensor, action_std: Tensor | None) -> None:
         """Set the region to search, in actions scaled to [-1, 1].
 
         A model only knows actions like those that it was trained on. Far from these, a search
         exploits the model's errors.
 
         Args:
-            rest: the action `[A]` that means no motion now. A search without a previous plan starts
-                there, or at the middle of the bounds if this method was never called.
-            usual: standard deviation `[A]` of the actions that the model was trained on, if known;
-                stored as an attribute for planners that draw around a mean.
+            still: the action `[A]` that means no motion now. A search without a previous plan
+                starts there, or at the middle of the bounds if this method was never called.
+            action_std: standard deviation `[A]` of the actions that the model was trained on, if
+                known; stored as an attribute for planners that draw around a mean.
         """
-        self._rest = rest.clamp(-1, 1)
-        self.usual = None if usual is None else usual.clamp(LEAST, 1)
+        self._still = still.clamp(-1, 1)
+        self.action_std = None if action_std is None else action_std.clamp(MIN_ACTION_STD, 1)
 
     def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
         """See `Planner.plan`.
@@ -141,8 +141,8 @@ class SearchPlanner(Planner):
         Raises:
             RecipeError: no candidate has a finite cost.
         """
-        before = self._resting(len(low)) if self.interpolation == "linear" else None
-        search = Search(cost, low, high, self.action_block, before)
+        previous = self._still_action(len(low)) if self.interpolation == "linear" else None
+        search = Search(cost, low, high, self.action_block, previous)
         self.search(search, self._start(len(low)), rng)
         if search.best is None:
             raise RecipeError(
@@ -150,19 +150,19 @@ class SearchPlanner(Planner):
                 "cost cannot be computed for any of them"
             )
         self._last = search.best
-        return Plan(search.actions(search.best[None])[0], search.least, search.evaluations)
+        return Plan(search.actions(search.best[None])[0], search.best_cost, search.evaluations)
 
-    def deviation(self, spread: float | None, without: float, start: Tensor) -> Tensor:
+    def initial_std(self, spread: float | None, default: float, start: Tensor) -> Tensor:
         """Standard deviation `[H, A]` of the first candidates.
 
         Args:
             spread: the value for all blocks; None for that of the training actions.
-            without: the value to use with None if that of the training actions is not known.
+            default: the value to use with None if that of the training actions is not known.
             start: blocks around which candidates are drawn, `[H, A]`.
         """
-        if spread is None and self.usual is not None:
-            return self.usual.expand_as(start).clone()
-        return torch.full_like(start, without if spread is None else spread)
+        if spread is None and self.action_std is not None:
+            return self.action_std.expand_as(start).clone()
+        return torch.full_like(start, default if spread is None else spread)
 
     @abstractmethod
     def search(self, search: Search, start: Tensor, rng: torch.Generator) -> None:
@@ -170,28 +170,28 @@ class SearchPlanner(Planner):
 
     def _start(self, action_size: int) -> Tensor:
         """Where to start: no motion, or with `warm_start` the rest of the previous plan."""
-        start = self._resting(action_size).expand(self.horizon, -1).clone()
+        start = self._still_action(action_size).expand(self.horizon, -1).clone()
         if self.warm_start and self._last is not None:
             start = self.shifted(self._last)
         return start
 
-    def _resting(self, action_size: int) -> Tensor:
+    def _still_action(self, action_size: int) -> Tensor:
         """The action `[A]` that means no motion now, in [-1, 1]."""
-        return torch.zeros(action_size) if self._rest is None else self._rest
+        return torch.zeros(action_size) if self._still is None else self._still
 
     def shifted(self, blocks: Tensor) -> Tensor:
         """Blocks `[…, H, A]` without those already taken; the last one is repeated at the end."""
-        rest = blocks[..., self.actions_per_plan // self.action_block :, :]
+        remaining = blocks[..., self.actions_per_plan // self.action_block :, :]
         end = blocks[..., -1:, :]
-        missing = self.horizon - rest.shape[-2]
-        return torch.cat([rest, *[end] * missing], -2)
+        missing = self.horizon - remaining.shape[-2]
+        return torch.cat([remaining, *[end] * missing], -2)
 
 
-def at_least(name: str, value: float, least: float) -> None:
+def at_least(name: str, value: float, minimum: float) -> None:
     """Check the lower limit of a planner's parameter.
 
     Raises:
-        RecipeError: the value is below `least`.
+        RecipeError: the value is below `minimum`.
     """
-    if not value >= least:
-        raise RecipeError(f"planner.{name}={value}: give {least} or more")
+    if not value >= minimum:
+        raise RecipeError(f"planner.{name}={value}: give {minimum} or more")

@@ -52,11 +52,11 @@ class Settings:
     goal_ahead: int | None = None
 
     def __post_init__(self) -> None:
-        least = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
-        for name, lowest in least.items():
+        minima = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
+        for name, minimum in minima.items():
             value = getattr(self, name)
-            if value is not None and value < lowest:
-                raise RecipeError(f"{name}={value}: give {lowest} or more")
+            if value is not None and value < minimum:
+                raise RecipeError(f"{name}={value}: give {minimum} or more")
 
     @property
     def estimates(self) -> bool:
@@ -110,21 +110,20 @@ def settings_of(
     components: dict[str, dict[str, Any]] = {"planner": {}, "cost": {}}
     plain: dict[str, Any] = {}
     types = get_type_hints(Settings)
-    known = [each.name for each in fields(Settings)]
-    chosen = PRESETS[preset] if preset != "default" else ()
-    for words in (PRESETS["default"], declared, chosen, overrides):
-        parsed = [parse_override(word) for word in words]
+    names = [field.name for field in fields(Settings)]
+    changes = PRESETS[preset] if preset != "default" else ()
+    for words in (PRESETS["default"], declared, changes, overrides):
+        items = [item for word in words for item in parse_override(word).items()]
         # names first: a new name drops the parameters of the previous component
-        for given in sorted(parsed, key=lambda each: isinstance(next(iter(each.values())), dict)):
-            for name, value in given.items():
-                if name not in known:
-                    raise RecipeError(f"{name} is not a setting of planning{suggest(name, known)}")
-                if name not in components:
-                    plain[name] = checked(name, value, types[name])
-                elif isinstance(value, dict):
-                    components[name] |= value
-                elif value != components[name].get("name"):
-                    components[name] = {"name": value}
+        for name, value in sorted(items, key=lambda item: isinstance(item[1], dict)):
+            if name not in names:
+                raise RecipeError(f"{name} is not a setting of planning{suggest(name, names)}")
+            if name not in components:
+                plain[name] = checked(name, value, types[name])
+            elif isinstance(value, dict):
+                components[name] |= value
+            elif value != components[name].get("name"):
+                components[name] = {"name": value}
     checked_choices = {name: check_component(name, choice) for name, choice in components.items()}
     return Settings(**checked_choices, **plain)
 
@@ -135,7 +134,7 @@ def words_of(settings: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(value, Mapping):
             params = dict(cast(Mapping[str, Any], value))
             yield f"{name}={params.pop('name')}"
-            yield from (f"{name}.{each}={show(v)}" for each, v in params.items())
+            yield from (f"{name}.{param}={show(v)}" for param, v in params.items())
         elif name == "weights" and value is not None:
             yield f"weights={str(value)[:12]}"
         elif name not in ("environment", "task") and value is not None:  # those are in the title

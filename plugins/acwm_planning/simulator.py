@@ -50,8 +50,8 @@ class SimulatorFutures(Futures):
         self._actions = actions.detach().cpu().numpy()
         self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
         self.length = len(self._ends)
-        self._snapshots: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
-        self._return: Callable[[], None] | None = None
+        self._observations: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
+        self._restore: Callable[[], None] | None = None
 
     def latents(self, frames: Sequence[int]) -> Latent:
         pictures = self._simulate(frames)[0]
@@ -63,9 +63,9 @@ class SimulatorFutures(Futures):
         return pictures.unflatten(0, (len(self._actions), -1))
 
     def observe(self, frames: Sequence[int]) -> Observation:
-        pictures, seen = self._simulate(frames)
+        pictures, observation = self._simulate(frames)
         if self._estimator is None or self._codec is None:
-            return seen
+            return observation
         latents = torch.cat([self.still(picture) for picture in pictures])
         with torch.no_grad():
             reconstructions = self._codec.decode(latents.expand(-1, 2, -1, -1, -1))[:, -1]
@@ -77,18 +77,18 @@ class SimulatorFutures(Futures):
     def still(self, picture: Frame) -> Latent:
         if self._codec is None:
             raise RecipeError("the simulator has no latents: take cost=state")
-        device = next((each.device for each in self._codec.parameters()), torch.device("cpu"))
+        device = next((weight.device for weight in self._codec.parameters()), torch.device("cpu"))
         return still_latent(self._codec, picture, device)
 
     def _simulate(self, frames: Sequence[int]) -> tuple[list[Frame], Observation]:
-        chosen = tuple(frames)
-        if chosen not in self._snapshots:
-            looks = [look for rows in self._actions for look in self._looks(rows, chosen)]
-            infos = [info for _, info in looks]
-            self._snapshots[chosen] = [frame for frame, _ in looks], observed(infos)
-        return self._snapshots[chosen]
+        key = tuple(frames)
+        if key not in self._observations:
+            results = [pair for rows in self._actions for pair in self._observe(rows, key)]
+            infos = [info for _, info in results]
+            self._observations[key] = [frame for frame, _ in results], observed(infos)
+        return self._observations[key]
 
-    def _looks(self, actions: NDArray[np.float32], frames: Sequence[int]):
+    def _observe(self, actions: NDArray[np.float32], frames: Sequence[int]):
         """Frame and info at each of these latent frames, in order."""
         environment, step = self._environment, 0
         self._start()
@@ -100,13 +100,13 @@ class SimulatorFutures(Futures):
 
     def _start(self) -> None:
         """Bring the environment to the end of the history."""
-        if self._return is not None:
-            self._return()
+        if self._restore is not None:
+            self._restore()
             return
         self._environment.reset(options={"spec": self._history.spec})
         for action in self._history.actions:
             self._environment.advance(action)
-        self._return = self._environment.snapshot()
+        self._restore = self._environment.snapshot()
 
 
 class SimulatorRollouts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,9 @@ from scipy.stats import binomtest
 
 from acwm_core.evaluation.statistics import CONFIDENCE, Estimate, with_interval, within
 from acwm_core.files import writing, written_whole
-from acwm_planning.jobs import PLAN_SUMMARY
+from acwm_planning.results import PLAN_SUMMARY, RowSummary
 from acwm_planning.resumable import Line
 from acwm_planning.settings import ROW_NAMES
-
-VIDEOS = "videos"
-"""Folder of a table's videos, beside `PLAN_SUMMARY` and the files of `ResumableResults`."""
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
@@ -43,41 +40,6 @@ class EpisodeLine:
     distance: float
     seconds_per_decision: float | None = None
     rollouts_per_decision: float | None = None
-
-
-HEADS = ("", "success", "95 %", "p", "final distance", "s / decision", "rollouts / decision")
-"""Heads of the columns in which a table is shown."""
-
-
-@dataclass(frozen=True)
-class RowSummary:
-    """One row of the table."""
-
-    row: str
-    seeds: list[int]  # numbers of the episodes, sorted
-    episodes: int
-    successes: int
-    success: Estimate  # share, with its exact interval (Clopper and Pearson 1934)
-    failures: int
-    distance: Estimate  # mean final distance, with its bootstrap interval
-    start_distance: float  # mean
-    # McNemar's p against the first row, on the seeds of both; None for the first row itself
-    p: float | None
-    seconds_per_decision: float | None
-    rollouts_per_decision: float | None
-
-    def cells(self) -> tuple[str, ...]:
-        """The row as text, under `HEADS`."""
-        low, high = 100 * (self.success.low or 0), 100 * (self.success.high or 0)
-        return (
-            self.row,
-            f"{self.successes}/{self.episodes}",
-            f"{low:.0f} to {high:.0f} %",
-            "" if self.p is None else f"{self.p:.2g}",
-            f"{self.distance.value:.3g} of {self.start_distance:.3g}",
-            "" if self.seconds_per_decision is None else f"{self.seconds_per_decision:.2g}",
-            "" if self.rollouts_per_decision is None else f"{self.rollouts_per_decision:.0f}",
-        )
 
 
 def summarise(lines: Sequence[Line]) -> list[RowSummary]:
@@ -117,12 +79,3 @@ def mcnemar(one: Mapping[int, Line], other: Mapping[int, Line]) -> float:
     pairs = [(bool(one[n]["success"]), bool(other[n]["success"])) for n in one if n in other]
     better, worse = pairs.count((True, False)), pairs.count((False, True))
     return float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
-
-
-def missing_episodes(
-    rows: Sequence[str], seeds: Sequence[int], lines: Sequence[Line]
-) -> Iterator[tuple[str, int]]:
-    """Episodes still to be played, seed by seed, so that a partial table compares all rows."""
-    finished = {(line["row"], line["seed"]) for line in lines}
-    for seed in seeds:
-        yield from ((row, seed) for row in rows if (row, seed) not in finished)

@@ -12,15 +12,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from acwm_core.data.pictures import magnification, to_pixels
 from acwm_core.data.video import write_mp4
 from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import Task, judged
-from acwm_core.evaluation import videos
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.videos import join_panels
 from acwm_core.files import writing, written_whole
 from acwm_core.model.shapes import Clip
 from acwm_planning.episode import EpisodeResult
 from acwm_planning.futures import History, ModelRollouts
+from acwm_planning.results import EpisodeCurves, PlannedDistances
 
 PANEL = 192
 """Approximate height of the encoded panels, in pixels."""
@@ -44,52 +46,12 @@ class Imagined:
     plans: list[tuple[int, Clip]]
 
 
-@dataclass(frozen=True)
-class PlannedDistances:
-    """What a decision predicted: distances `[L]` at some frames `[L]` of the episode."""
-
-    frames: list[int]
-    distances: list[float | None]
-
-
-@dataclass(frozen=True)
-class EpisodeCurves:
-    """The contents of the JSON file next to a video.
-
-    Attributes:
-        row: who acted.
-        seed: number of the episode.
-        success: whether the task was solved.
-        failed: whether the task failed, which no later success can undo.
-        unit: unit of the distances.
-        tolerance: largest distance that counts as success.
-        fps: frames per second.
-        panels: names of the video's panels.
-        distances: distance from the goal in every frame, from the simulator.
-        imagined: the same in the model's frames, read by an estimator. None where it cannot read
-            it; empty without a model or an estimator.
-        plans: what each decision predicted for its whole plan; empty if `imagined` is empty.
-    """
-
-    row: str
-    seed: int
-    success: bool
-    failed: bool
-    unit: str
-    tolerance: float
-    fps: float
-    panels: list[str]
-    distances: list[float | None]
-    imagined: list[float | None]
-    plans: list[PlannedDistances]
-
-
 def imagine(result: EpisodeResult, rollouts: ModelRollouts, still: NDArray[np.float32]) -> Imagined:
     """What the model predicted for the actions that were taken, and for those that were planned."""
     history, decisions = result.history, result.decisions
     first = as_clip(history.frames[0][None])
     clips, plans = [first], list[tuple[int, Clip]]()
-    ends = [*(each.frame for each in decisions[1:]), len(history.actions)]
+    ends = [*(decision.frame for decision in decisions[1:]), len(history.actions)]
     stride = rollouts.world_model.codec.temporal_stride
     for decision, end in zip(decisions, ends, strict=True):
         now = decision.frame
@@ -154,11 +116,11 @@ def write_episode(
     """Write an episode as MP4, panel by panel, and its curves as a JSON file next to it."""
     happened = np.stack(result.history.frames)
     goal = np.broadcast_to(result.goal.frame, happened.shape)
-    panels = [happened, *([videos.to_pixels(imagined)] if imagined is not None else []), goal]
+    panels = [happened, *([to_pixels(imagined)] if imagined is not None else []), goal]
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    times = videos.magnification(happened.shape[1], PANEL)
-    write_mp4(path, videos.join(panels), curves.fps, times)
+    times = magnification(happened.shape[1], PANEL)
+    write_mp4(path, join_panels(panels), curves.fps, times)
     with writing(path), written_whole(path.with_suffix(".json")) as partial:
         partial.write_text(json.dumps(asdict(curves), allow_nan=False), encoding="utf-8")
 

@@ -112,6 +112,6 @@ class ActionSource:
 
 def _places(values: list[list[float]]) -> NDArray[np.float64] | None:
     """Places `[P, 2]`, or None if the values are not places."""
-    if not values or any(len(each) != 2 for each in values):
+    if not values or any(len(place) != 2 for place in values):
         return None
     return np.clip(np.array(values, np.float64), 0, 1)

@@ -14,9 +14,9 @@ from acwm_core.env.task import Frame, Goal
 class Driver(ABC):
     """Solves a task in a simulator of which it sees pictures only.
 
-    It is made with `world_model`, the `card` of the simulator, `task`, `usual` (standard deviation
-    `[A]` of the raw actions that the model was trained on, or None) and `steps` (sampling steps, or
-    None for the model's own number).
+    It is created with `world_model`, the `card` of the simulator, `task`, `action_std` (standard
+    deviation `[A]` of the raw actions that the model was trained on, or None) and `steps` (sampling
+    steps, or None for the model's own number).
     """
 
     @abstractmethod

@@ -104,9 +104,10 @@ class GoalEpisode:
             self._driver = await run("driver", self._create_driver, goal, still)
         self._tell_phase("planning")
         recent = [*self._live.recent]
-        frames, past = [each.frame for each in recent], [each.action for each in recent[1:]]
-        actions, self._seconds = await run("driver", self._ask_driver, self._driver, frames, past)
-        self._plan.extend(actions)
+        frames = [time_step.frame for time_step in recent]
+        actions = [time_step.action for time_step in recent[1:]]
+        plan, self._seconds = await run("driver", self._ask_driver, self._driver, frames, actions)
+        self._plan.extend(plan)
         self._decisions += 1
         self._tell_phase("acting")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Physics
 from acwm_core.plugins import catalog
-from acwm_play.simulator import Scene, Simulator
+from acwm_play.simulator import SceneSpec, Simulator
 
 KEYS = (
     *(("ArrowLeft", "ArrowRight"), ("ArrowDown", "ArrowUp"), ("KeyA", "KeyD"), ("KeyS", "KeyW")),
@@ -133,7 +133,7 @@ class Pointing:
         still_actions: list[NDArray[np.float64]] = []
         bodies: list[NDArray[np.float64]] = []
         for index in range(SAMPLES):
-            time_step = simulator.start(Scene(index))[0]
+            time_step = simulator.start(SceneSpec(index))[0]
             still_actions.append(np.asarray(simulator.still(), np.float64))
             rows = [r.of(time_step.state) for r in physics.readings if r.kind == "position"]
             bodies.append(np.concatenate([r.reshape(-1, r.shape[-1])[:, :2] for r in rows]))
@@ -141,7 +141,7 @@ class Pointing:
             _fit_map(np.stack(bodies, 1), np.stack(still_actions)[:, i : i + 2])
             for i in range(0, action.size, 2)
         ]
-        if any(each is None for each in maps):
+        if any(fit is None for fit in maps):
             return None
         height, width = simulator.card.frame_size
         return cls(physics, width / height, np.stack([m for m in maps if m is not None]))
@@ -157,8 +157,8 @@ class Pointing:
         """The inverse of `action`."""
         pairs = np.asarray(action, np.float64).reshape(-1, 2)
         ground = np.zeros((len(pairs), 3))
-        for k, (row, each) in enumerate(zip(pairs, self._maps, strict=True)):
-            ground[k, :2] = np.linalg.solve(each[:2].T, row - each[2])
+        for k, (row, fit) in enumerate(zip(pairs, self._maps, strict=True)):
+            ground[k, :2] = np.linalg.solve(fit[:2].T, row - fit[2])
         return self._camera.to_frame(ground)[:, :2] / [self._aspect, 1.0] + 0.5
 
 

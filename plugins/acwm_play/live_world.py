@@ -18,7 +18,7 @@ from acwm_play.layout import controls, physics_of
 from acwm_play.live_model import LiveModel
 from acwm_play.process import SimulatorProcess
 from acwm_play.recorded import RecordedVideo
-from acwm_play.simulator import Scene, TimeStep
+from acwm_play.simulator import SceneSpec, TimeStep
 from acwm_play.workers import Workers
 from acwm_play.worlds import World, tasks_of
 
@@ -52,7 +52,7 @@ class LiveWorld:
     instruments: Instruments
     controls: list[dict[str, Any]]
     tasks: dict[str, Task]
-    scene: Scene
+    scene: SceneSpec
     recent: deque[TimeStep]
     apart: bool = False
 
@@ -78,9 +78,9 @@ class LiveWorld:
         layout = controls(card, physics_of(world.environment))
         tasks = tasks_of(world.environment) if catalog().registry("driver") else {}
         parts = world, workers, simulator, model, instruments, layout, tasks
-        return cls(*parts, Scene(0), deque(maxlen=max(MEMORY, model.given)))
+        return cls(*parts, SceneSpec(0), deque(maxlen=max(MEMORY, model.given)))
 
-    async def begin(self, scene: Scene) -> tuple[TimeStep, NDArray[np.uint8]]:
+    async def begin(self, scene: SceneSpec) -> tuple[TimeStep, NDArray[np.uint8]]:
         """Start a scene; returns the simulator's time step and the model's picture of it."""
         time_steps = await self.simulator.start(scene, self.model.given)
         self.recent.clear()
@@ -148,7 +148,8 @@ class LiveWorld:
 
 
 def _describe_drivers() -> list[dict[str, str]]:
-    return [{"name": each.name, "summary": each.summary} for each in catalog().registry("driver")]
+    drivers = catalog().registry("driver")
+    return [{"name": driver.name, "summary": driver.summary} for driver in drivers]
 
 
 def _describe_task(name: str, task: Task) -> dict[str, Any]:

@@ -31,7 +31,8 @@ class PlanningDriver(Driver):
         world_model: the world model, in evaluation mode.
         card: card of the simulator.
         task: the task to solve.
-        usual: standard deviation `[A]` of the raw actions that the model was trained on, if known.
+        action_std: standard deviation `[A]` of the raw actions that the model was trained on, if
+            known.
         steps: sampling steps; those of the task's settings, or the model's own, by default.
     """
 
@@ -41,7 +42,7 @@ class PlanningDriver(Driver):
         world_model: WorldModel,
         card: EnvironmentCard,
         task: Task,
-        usual: Sequence[float] | None = None,
+        action_std: Sequence[float] | None = None,
         steps: int | None = None,
     ) -> None:
         overrides = [] if steps is None else [f"steps={steps}"]
@@ -50,7 +51,7 @@ class PlanningDriver(Driver):
         rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
         self._card, self._task, self._rollouts = card, task, _InterruptibleRollouts(rollouts)
         planner, cost = make_planner(settings), make_cost(settings)
-        self._controller = PlanningController(planner, self._rollouts, cost, usual=usual)
+        self._controller = PlanningController(planner, self._rollouts, cost, action_std=action_std)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
         self._controller.aim(self._task, goal, self._card.action, still, seed)

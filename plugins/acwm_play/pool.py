@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from acwm_play.live_world import LiveWorld
-from acwm_play.simulator import Scene
+from acwm_play.simulator import SceneSpec
 from acwm_play.workers import Workers
 from acwm_play.worlds import World
 
@@ -40,7 +40,7 @@ class WorldPool:
         So errors are reported at once, and the page has pictures as soon as it is open.
         """
         self._spare = await LiveWorld.create(next(iter(self.worlds.values())), self.workers)
-        await self._spare.begin(Scene(0))
+        await self._spare.begin(SceneSpec(0))
 
     async def acquire(self, world: World) -> LiveWorld:
         """A running world, for one session."""

@@ -16,7 +16,7 @@ from acwm_core.env.task import Goal
 from acwm_core.errors import PluginError, RecipeError, sentence
 from acwm_core.executors import worker_context
 from acwm_play.layout import Pointing, physics_of
-from acwm_play.simulator import SCENES, Scene, Simulator, TaskProgress, TimeStep
+from acwm_play.simulator import SCENES, SceneSpec, Simulator, TaskProgress, TimeStep
 
 PATIENCE = 5.0
 """Seconds to wait for a process to end before it is killed."""
@@ -58,7 +58,7 @@ class SimulatorProcess:
             raise
         return process
 
-    async def start(self, scene: Scene, frames: int) -> list[TimeStep]:
+    async def start(self, scene: SceneSpec, frames: int) -> list[TimeStep]:
         """See `Simulator.start`."""
         return await self._do(self._request, "start", scene, frames)
 

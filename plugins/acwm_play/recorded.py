@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import DataError, RecipeError
-from acwm_play.simulator import Scene, TaskProgress, TimeStep
+from acwm_play.simulator import SceneSpec, TaskProgress, TimeStep
 
 
 class RecordedVideo:
@@ -45,7 +45,7 @@ class RecordedVideo:
         self._actions = np.zeros((0, self.card.action.size), np.float32)
         self._at = 0
 
-    async def start(self, scene: Scene, frames: int) -> list[TimeStep]:
+    async def start(self, scene: SceneSpec, frames: int) -> list[TimeStep]:
         """The first `frames` frames of an episode."""
         index = scene.index % self.scenes
         video = self._data.video(index).transpose(0, 2, 3, 1)

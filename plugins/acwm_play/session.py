@@ -26,7 +26,7 @@ from acwm_play.live_world import LiveWorld
 from acwm_play.messages import Outbox, PageMessage, pack
 from acwm_play.pool import WorldPool
 from acwm_play.recorder import MAX_FRAMES, Recording, save
-from acwm_play.simulator import Scene, TimeStep
+from acwm_play.simulator import SceneSpec, TimeStep
 
 REST = 2.0
 """How long instruments pause, relative to the time they worked, because frames come first."""
@@ -55,7 +55,7 @@ class Session:
         self._keep_recording = False
         self._predicting: asyncio.Task[None] | None = None
         self._measuring: asyncio.Task[None] | None = None
-        self._floor_scene: Scene | None = None
+        self._floor_scene: SceneSpec | None = None
         self._floors: dict[str, float | None] = {}
         self._pace = 0.0
         self._step = False
@@ -146,7 +146,9 @@ class Session:
         await self._save()
         live, before = await self._acquire(request.world)
         factors = request.factors
-        scene = Scene.draw(factors) if request.index is None else Scene(request.index, factors)
+        scene = (
+            SceneSpec.draw(factors) if request.index is None else SceneSpec(request.index, factors)
+        )
         try:
             time_step, frame = await live.begin(scene)
         except Exception as error:
@@ -160,7 +162,7 @@ class Session:
         self._tell("world", **live.about(time_step), **rest, menu=self._pool.menu())
         self._show_start(time_step, frame)
 
-    async def _acquire(self, name: str | None) -> tuple[LiveWorld, Scene | None]:
+    async def _acquire(self, name: str | None) -> tuple[LiveWorld, SceneSpec | None]:
         """A running world (by default the same one), and the scene that it currently shows."""
         live = self._live
         world = self._pool.worlds.get(name or "") or (live.world if live else None)

@@ -22,7 +22,7 @@ SCENES = 100_000
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneSpec:
     """The start of a world: an episode of the training split, with other factors if requested.
 
     Attributes:
@@ -34,7 +34,7 @@ class Scene:
     factors: Mapping[str, FactorValue] = field(default_factory=dict[str, FactorValue])
 
     @classmethod
-    def draw(cls, factors: Mapping[str, FactorValue]) -> Scene:
+    def draw(cls, factors: Mapping[str, FactorValue]) -> SceneSpec:
         """Draw a random scene with these factors."""
         return cls(secrets.randbelow(SCENES), factors)
 
@@ -99,7 +99,7 @@ class Simulator:
         self._goal_environment: TaskEnvironment | None = None
         self._solved = False
 
-    def start(self, scene: Scene, frames: int = 1) -> list[TimeStep]:
+    def start(self, scene: SceneSpec, frames: int = 1) -> list[TimeStep]:
         """Build a scene and hold still for `frames` frames, as many as a model is given."""
         spec = EpisodeSpec(self.card.name, "train", scene.index, factors=dict(scene.factors))
         with noting(f"in scene {scene.index}", self.environment):
@@ -159,9 +159,9 @@ class Simulator:
 
     def close(self) -> None:
         """Free the environments' resources."""
-        for each in (self.environment, self._goal_drawer):
-            if each is not None:
-                each.close()
+        for environment in (self.environment, self._goal_drawer):
+            if environment is not None:
+                environment.close()
 
     def _time_step(
         self, frame: NDArray[np.uint8], info: Mapping[str, Any], action: NDArray[np.float32]

@@ -16,7 +16,7 @@ from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import find_run
-from acwm_planning.run import usual_actions
+from acwm_planning.run import action_std_of
 from acwm_play.driver import Driver
 from acwm_play.live_model import LiveModel
 from acwm_play.worlds import World
@@ -62,7 +62,7 @@ class Workers:
                 world_model=self._model("driver", world),
                 card=card,
                 task=task,
-                usual=usual_actions(find_run(world.run)),
+                action_std=action_std_of(find_run(world.run)),
                 steps=self._steps,
             )
         )

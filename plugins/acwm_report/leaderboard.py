@@ -9,7 +9,7 @@ from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.files import inside
-from acwm_planning.jobs import PLANS
+from acwm_planning.results import PLANS
 from acwm_report.boards import boards_of
 from acwm_report.cards import cards_of, entry_facts
 from acwm_report.entry import Entry, entry_of

@@ -3,63 +3,27 @@
 from __future__ import annotations
 
 import base64
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 from markupsafe import Markup
 
+from acwm_core.errors import AcwmWarning, DataError
 from acwm_core.files import read_json
 from acwm_experiment.table import Experiment
+from acwm_planning.results import VIDEOS, EpisodeCurves
 from acwm_report.plans import distance_scale, plan_results
 from acwm_report.run import EvaluatedRun, result_files
-
-VIDEOS = "videos"
-"""Folder of a task's videos: ``RUN/planning/TASK/videos/model-*.mp4``, each beside its curves."""
 
 MOST_VIDEOS = 4
 """Most videos per task on a page."""
 
 
 @dataclass(frozen=True)
-class PlannedDistances:
-    """The distances that a decision of the planner expected at some frames of the episode."""
-
-    frames: list[int]
-    distances: list[float | None]
-
-
-@dataclass(frozen=True)
-class PlanCurves:
-    """The file beside a video: the distance from the goal in each frame."""
-
-    row: str  # who acted, e.g. the planner with the model
-    seed: int  # number of the episode
-    success: bool
-    failed: bool
-    unit: str  # unit of the distances
-    tolerance: float  # largest distance that counts as success
-    fps: float
-    panels: list[str]
-    distances: list[float | None]  # the true ones, from the simulator
-    # the ones that the model predicted
-    imagined: list[float | None] = field(default_factory=list[float | None])
-    plans: list[PlannedDistances] = field(default_factory=list[PlannedDistances])
-
-    @property
-    def widest_gap(self) -> tuple[int, float] | None:
-        """The frame in which imagined and true distance differ most, and the difference."""
-        gaps = [
-            (frame, abs(seen - true))
-            for frame, (seen, true) in enumerate(zip(self.imagined, self.distances, strict=False))
-            if seen is not None and true is not None
-        ]
-        return max(gaps, key=lambda each: each[1], default=None)
-
-
-@dataclass(frozen=True)
-class Drawing:
+class CurveDrawing:
     """Curves in a box from (0, 0) to (1, 1). The bottom of the box is distance 0.
 
     Attributes:
@@ -85,13 +49,8 @@ class PlanVideo:
 
     key: str  # its id on the page
     task: str
-    curves: PlanCurves
-    data: bytes  # the MP4 file
-
-    @property
-    def base64(self) -> Markup:
-        """The MP4 file as base64 text."""
-        return Markup(base64.b64encode(self.data).decode())
+    curves: EpisodeCurves
+    source: str  # the MP4 file: its path from the page, or a data URL
 
     @property
     def outcome(self) -> str:
@@ -109,7 +68,7 @@ class PlanVideo:
         return f"wrong by up to {scale.number(gap)} {scale.unit}, after {frame} actions"
 
     @property
-    def drawing(self) -> Drawing:
+    def drawing(self) -> CurveDrawing:
         """The curves of the video."""
         shown, scale = self.curves, distance_scale(self.curves.unit)
         own = [*shown.distances, *shown.imagined]
@@ -129,7 +88,7 @@ class PlanVideo:
 
         frames, widest = range(len(own)), shown.widest_gap
         plans = [points(each.frames, each.distances) for each in shown.plans]
-        return Drawing(
+        return CurveDrawing(
             top=f"{scale.number(top)} {scale.unit}",
             tolerance=1 - shown.tolerance / top,
             happened=points(frames, shown.distances),
@@ -157,11 +116,26 @@ class VideoRoom:
         chosen: list[PlanVideo] = []
         pattern = f"{folder.relative_to(root)}/{VIDEOS}/model-*.json"
         for path in result_files(root, pattern)[:MOST_VIDEOS]:
-            curves, data = read_json(path, PlanCurves, "curves of a video"), _video(path)
+            curves, data = read_json(path, EpisodeCurves, "curves of a video"), _video(path)
             if data and len(data) <= self._bytes:
                 self._bytes -= len(data)
-                chosen.append(PlanVideo(f"{key}-{len(chosen)}", task, curves, data))
+                source = Markup("data:video/mp4;base64," + base64.b64encode(data).decode())
+                chosen.append(PlanVideo(f"{key}-{len(chosen)}", task, curves, source))
         return chosen
+
+
+def linked_videos(folder: Path, row: str, task: str) -> list[PlanVideo]:
+    """The videos of one way to act, for a page in the folder of results that links to them."""
+    videos: list[PlanVideo] = []
+    for path in sorted((folder / VIDEOS).glob(f"{row}-*.json")):
+        source = f"{VIDEOS}/{path.stem}.mp4"
+        try:
+            curves = read_json(path, EpisodeCurves, "curves of a video")
+        except DataError as error:
+            warnings.warn(f"{error}: its video is not shown", AcwmWarning, stacklevel=2)
+        else:
+            videos.append(PlanVideo(path.stem, task, curves, source))
+    return videos
 
 
 def plan_videos(runs: Sequence[EvaluatedRun], room: VideoRoom) -> list[list[PlanVideo]]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
 from acwm_core.evaluation.results import Estimate
-from acwm_core.files import read_json
 from acwm_experiment.table import Experiment
-from acwm_planning.jobs import PLAN_SUMMARY, PLANS, PlanningJob
+from acwm_planning.jobs import PlanningJob
+from acwm_planning.results import PLAN_SUMMARY, PLANS, PlanTable, RowSummary
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import MISSING, PERCENT, Cell, Column, Row, Scale, Table
 
@@ -31,40 +31,11 @@ ROWS = {
 """Title and explanation of each way to act."""
 
 
-@dataclass(frozen=True)
-class PlannedRow:
-    """The results of one way to act."""
-
-    row: str  # a key of `ROWS`
-    episodes: int
-    successes: int
-    success: Estimate  # share of solved episodes
-    distance: Estimate  # mean distance from the goal at the end
-    start_distance: float  # mean distance at the start
-    p: float | None = None  # p-value of the difference in successes from the first row
-    seconds_per_decision: float | None = None
-
-
-@dataclass(frozen=True)
-class PlanTable:
-    """A result table of `acwm plan`; other fields of the file are not read."""
-
-    environment: str
-    task: str
-    rows: list[PlannedRow]
-    unit: str = ""  # unit of the distances
-    file_sha256: str | None = None  # SHA-256 of the model's file
-
-    def row(self, name: str) -> PlannedRow | None:
-        """The row of that name; None if there is none."""
-        return next((each for each in self.rows if each.row == name), None)
-
-
 def plan_tables_of(run: Path, weights: str) -> dict[Path, PlanTable]:
     """The plan tables made with these weights, by folder, in order of their tasks."""
     files = result_files(run, f"{PLANS}/*/{PLAN_SUMMARY}")
-    found = {path.parent: read_json(path, PlanTable, "a table of plans") for path in files}
-    return {path: each for path, each in found.items() if each.file_sha256 == weights}
+    found = {path.parent: PlanTable.read(path.parent) for path in files}
+    return {path: table for path, table in found.items() if table.file_sha256 == weights}
 
 
 def plan_results(run: EvaluatedRun) -> dict[Path, PlanTable]:
@@ -78,15 +49,17 @@ def distance_scale(unit: str) -> Scale:
 
 
 def plan_tables(run: EvaluatedRun) -> list[Table]:
-    """Per task: success and final distance of each way to act, on the same episodes."""
-    tables: list[Table] = []
-    for found in plan_results(run).values():
-        scale = distance_scale(found.unit)
-        rows = [_row(each, scale) for each in found.rows]
-        head = f"{found.task} · {max((each.episodes for each in found.rows), default=0)} episodes"
-        name = f"plans-{found.task}"
-        tables.append(Table(head, _columns(scale.unit), rows, "Who acts", CAPTION, name))
-    return tables
+    """A `plan_table` per task."""
+    return [plan_table(found) for found in plan_results(run).values()]
+
+
+def plan_table(found: PlanTable) -> Table:
+    """Success and final distance of each way to act, on the same episodes."""
+    scale = distance_scale(found.unit)
+    rows = [_row(row, scale) for row in found.rows]
+    head = f"{found.task} · {max((row.episodes for row in found.rows), default=0)} episodes"
+    name = f"plans-{found.task}"
+    return Table(head, _columns(scale.unit), rows, "Who acts", CAPTION, name)
 
 
 def task_tables(experiment: Experiment | None) -> list[Table]:
@@ -110,28 +83,30 @@ def task_tables(experiment: Experiment | None) -> list[Table]:
 
 
 def _task_rows(plan: PlanningJob) -> list[Row]:
-    found = read_json(plan.folder / PLAN_SUMMARY, PlanTable, "a table of plans")
+    found = PlanTable.read(plan.folder)
     scale, group = distance_scale(found.unit), f"{plan.row} · {plan.task}"
-    asked = [each for each in found.rows if each.row in plan.rows]
-    return [replace(_row(each, scale, scale.unit), group=group) for each in asked]
+    rows = [row for row in found.rows if row.row in plan.rows]
+    return [replace(_row(row, scale, scale.unit), group=group) for row in rows]
 
 
 def _columns(unit: str = "") -> list[Column]:
     """The columns of a table of plans; without a `unit` of distances, each cell has its own."""
     solved = Column("Solved"), Column("Share", PERCENT.unit, better="↑")
     distances = Column("Final distance", unit, better="↓"), Column("At the start", unit)
-    return [*solved, *distances, Column("p"), Column("Seconds per decision")]
+    efforts = Column("Seconds per decision"), Column("Rollouts per decision")
+    return [*solved, *distances, Column("p"), *efforts]
 
 
-def _row(found: PlannedRow, scale: Scale, unit: str = "") -> Row:
+def _row(found: RowSummary, scale: Scale, unit: str = "") -> Row:
     title, note = ROWS.get(found.row, (found.row, ""))
     distances = (Cell.of(each, scale) for each in (found.distance, Estimate(found.start_distance)))
-    seconds = found.seconds_per_decision
+    seconds, rollouts = found.seconds_per_decision, found.rollouts_per_decision
     cells = [
         Cell(f"{found.successes}/{found.episodes}", value=found.successes),
         Cell.of(found.success, PERCENT),
         *(replace(cell, text=f"{cell.text} {unit}".strip()) for cell in distances),
         Cell(MISSING if found.p is None else f"{found.p:.2g}", value=found.p),
         Cell(MISSING if seconds is None else f"{seconds:.2g}", value=seconds),
+        Cell(MISSING if rollouts is None else f"{rollouts:.0f}", value=rollouts),
     ]
     return Row(title, cells, note, strong=found.row == "model")

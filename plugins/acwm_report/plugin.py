@@ -1,11 +1,11 @@
-"""Register the commands that evaluate, report and compare runs."""
+"""Register the commands that evaluate runs, act with them, report and compare."""
 
 from acwm_core.plugins import Registry, hookimpl
 
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    """Add `evaluate`, `report`, `compare` and `leaderboard`, and `report` to the group `data`."""
+    """Add what measures and shows runs, and `report` to the group `data`."""
     registry.add(
         "data.report",
         "acwm_report.commands:data_report",
@@ -16,6 +16,18 @@ def register_commands(registry: Registry) -> None:
         "acwm_report.commands:evaluate",
         summary="measure how good a trained model is",
         after="import-checkpoint",
+    )
+    registry.add(
+        "plan",
+        "acwm_report.planning:plan",
+        summary="act by planning with a model, in the simulator",
+        after="evaluate",
+    )
+    registry.add(
+        "rank",
+        "acwm_report.planning:rank",
+        summary="rank policies in a model, and compare with the simulator",
+        after="plan",
     )
     registry.add(
         "report",

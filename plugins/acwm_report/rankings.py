@@ -30,34 +30,34 @@ def rankings_of(run: Path, weights: str) -> list[Ranking]:
 
 
 def ranking_tables(run: EvaluatedRun) -> list[Table]:
-    """Per task: how well policy scores agree with the simulator's, and the regret of choices."""
-    tables: list[Table] = []
-    for found in rankings(run):
-        columns = [Column(title, better="↑") for title in ("Pearson", "Spearman", "Kendall")]
-        columns += [Column("MMRV", better="↓"), Column("Optimism")]
-        rows: list[Row] = []
-        for judge, (title, note) in JUDGES.items():
-            for score, by in found.agreement[judge].items():
-                values = by.pearson, by.spearman, by.kendall, by.mmrv
-                cells = [Cell.of(value, PLAIN) for value in values]
-                cells.append(Cell.of(by.optimism, PLAIN, signed=True))
-                what = "success" if score == "success" else "return"
-                rows.append(Row(f"{title}, {what}", cells, note, strong=judge == "model"))
-        choices = found.decisions.get("model")
-        lost = (
-            ""
-            if choices is None
-            else (
-                f"Choosing among action sequences as the model would loses "
-                f"{_text(choices.regret.value)} {found.unit} per action, at random "
-                f"{_text(choices.chance.value)}, over {choices.starts} starts. "
-            )
+    """A `ranking_table` per task."""
+    return [ranking_table(found) for found in rankings(run)]
+
+
+def ranking_table(found: Ranking) -> Table:
+    """How well policy scores agree with the simulator's, and the regret of choices."""
+    columns = [Column(title, better="↑") for title in ("Pearson", "Spearman", "Kendall")]
+    columns += [Column("MMRV", better="↓"), Column("Optimism")]
+    rows: list[Row] = []
+    for judge, (title, note) in JUDGES.items():
+        for score, by in found.agreement[judge].items():
+            cells = [Cell.of(v, PLAIN) for v in (by.pearson, by.spearman, by.kendall, by.mmrv)]
+            cells.append(Cell.of(by.optimism, PLAIN, signed=True))
+            score_title = "success" if score == "success" else "return"
+            rows.append(Row(f"{title}, {score_title}", cells, note, strong=judge == "model"))
+    choices = found.decisions.get("model")
+    lost = (
+        ""
+        if choices is None
+        else (
+            f"Choosing among action sequences as the model would loses "
+            f"{_text(choices.regret.value)} {found.unit} per action, at random "
+            f"{_text(choices.chance.value)}, over {choices.starts} starts. "
         )
-        caption = f"{lost}{_unread(found)}Returns are minus sums of distances in {found.unit}."
-        head = f"{found.task} · {len(found.policies)} policies, {found.episodes} episodes of each"
-        name = f"policies-{found.task}"
-        tables.append(Table(head, columns, rows, "Judged by", caption, name))
-    return tables
+    )
+    caption = f"{lost}{_unread(found)}Returns are minus sums of distances in {found.unit}."
+    head = f"{found.task} · {len(found.policies)} policies, {found.episodes} episodes of each"
+    return Table(head, columns, rows, "Judged by", caption, f"policies-{found.task}")
 
 
 def ranking_charts(run: EvaluatedRun) -> list[Chart]:

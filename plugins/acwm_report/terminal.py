@@ -23,7 +23,9 @@ if TYPE_CHECKING:
         SetSummary,
         Summary,
     )
+    from acwm_planning.policies.ranking import Ranking
     from acwm_report.comparison import Comparison, Difference
+    from acwm_report.table import Table as PageTable
     from acwm_severity.curves import SeverityCurve
 
 ROWS = {
@@ -282,6 +284,52 @@ def _print_uses(console: Console, comparison: Comparison, letters: Mapping[str, 
         values = (f"{c.text} ({c.interval})" if c.interval else c.text for c in cells)
         table.add_row(" ".join(title.split()), *values)
     console.print(table)
+
+
+def print_page_table(table: PageTable) -> None:
+    """Print a table of a page: below each number is its 95 % interval, as there."""
+    from rich.console import Console
+    from rich.table import Table
+
+    grid = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, title=table.title)
+    grid.title_justify, grid.title_style = "left", "bold"
+    grid.add_column(table.corner, overflow="fold")
+    for column in table.columns:
+        head = f"{column.title} {column.unit} {column.better}".strip()
+        grid.add_column("\n".join(head.split()), justify="right", overflow="fold")
+    for row in table.rows:
+        cells = (f"{cell.text}\n{cell.interval}".rstrip() for cell in row.cells)
+        grid.add_row(row.title, *cells)
+    Console(highlight=False, markup=False).print(grid, table.caption, sep="\n")
+
+
+def print_ranking(ranking: Ranking) -> None:
+    """Print the policies, best true score first, and how well the judges agree with the truth."""
+    from rich.console import Console
+
+    from acwm_report.rankings import ranking_table
+
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:  # a file or a pipe has no width
+        console.width = 200
+    table = _wide_table(console, "")
+    heads = ("success\n(true)", "(model)", "return\n(true)", "(model)")
+    for head in ("policy", "loop", *heads):
+        table.add_column(head, justify="right" if head in heads else "left")
+    for policy in ranking.policies:
+        success = (f"{100 * policy.success[judge]:.0f} %" for judge in ("truth", "model"))
+        returns = (f"{policy.returns[judge]:.3g}" for judge in ("truth", "model"))
+        table.add_row(policy.policy, policy.loop, *success, *returns)
+    console.print(table)
+    for policy in ranking.policies:
+        for judge, count in policy.unread.items():
+            console.print(
+                f"{policy.policy}: in {count} of {ranking.episodes} episodes the estimator could "
+                f"not read the distance in the {'true' if judge == 'estimator' else 'predicted'} "
+                "frames; the start distance is used instead"
+            )
+    print_page_table(ranking_table(ranking))
+    click.echo("MMRV: mean maximum rank violation; optimism: judge minus truth")
 
 
 def _wide_table(console: Console, title: str) -> Table:

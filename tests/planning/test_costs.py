@@ -132,7 +132,7 @@ def test_what_a_model_predicts_in_part_is_read_from_pictures():
     """And not planned by without a distance."""
     pictures = StateDistance(frames=1)(Known(PLACES), tiny.PLACE, GOAL)
     assert StateDistance(frames=1)(Half(PLACES), tiny.PLACE, GOAL).equal(pictures)
-    with pytest.raises(RecipeError, match="no distance can be told: set"):
+    with pytest.raises(RecipeError, match="no distance can be computed from what"):
         StateDistance(read="model")(Half(PLACES), tiny.PLACE, GOAL)
 
 

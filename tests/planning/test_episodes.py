@@ -10,7 +10,6 @@ import torch
 from acwm_core.data.simulate import simulate
 from acwm_core.errors import RecipeError
 from acwm_planning.controllers import (
-    NoSolutionError,
     PlanningController,
     RandomController,
     ScriptedController,
@@ -20,6 +19,7 @@ from acwm_planning.costs import StateDistance
 from acwm_planning.episode import TaskVariant, play
 from acwm_planning.futures import History
 from acwm_planning.sampling import CrossEntropy, ImprovedCrossEntropy
+from acwm_planning.scripts import NoSolutionError
 from acwm_planning.simulator import SimulatorFutures, SimulatorRollouts
 from tests import tiny
 
@@ -94,22 +94,22 @@ def test_a_planner_is_told_what_no_motion_is(kind, monkeypatch):
     asked = []
 
     class Told(ImprovedCrossEntropy):
-        def search_near(self, rest, usual):
-            asked.append((rest, usual))
-            super().search_near(rest, usual)
+        def search_near(self, still, action_std):
+            asked.append((still, action_std))
+            super().search_near(still, action_std)
 
     card = replace(tiny.Slide.card, action=replace(tiny.Slide.card.action, kind=kind))
     monkeypatch.setattr(tiny.Slide, "card", card)
     rollouts = SimulatorRollouts(tiny.Slide(), stride=2)
-    controller = PlanningController(Told(**SMALL), rollouts, StateDistance(), usual=[0.5, 1.0])
+    controller = PlanningController(Told(**SMALL), rollouts, StateDistance(), action_std=[0.5, 1.0])
     taken = np.stack(played(controller, 0).history.actions)
     assert len(asked) == len(controller.decisions) > 2
     high = np.array(card.action.high)
-    for decision, (rest, usual) in zip(controller.decisions, asked, strict=True):
+    for decision, (still, action_std) in zip(controller.decisions, asked, strict=True):
         moved = kind == "absolute" and decision.frame
         expected = taken[decision.frame - 1] / high if moved else np.zeros(2)
-        np.testing.assert_allclose(rest.numpy(), expected, atol=1e-6)
-        np.testing.assert_allclose(usual.numpy(), [0.5, 1.0] / high)
+        np.testing.assert_allclose(still.numpy(), expected, atol=1e-6)
+        np.testing.assert_allclose(action_std.numpy(), [0.5, 1.0] / high)
 
 
 def test_actions_of_a_plan_are_taken_until_the_next():

@@ -11,8 +11,10 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_core.env.task import Goal
-from acwm_planning.page import write_page
+from acwm_core.evaluation.results import write_json
+from acwm_planning.results import PlanTable
 from acwm_planning.settings import ROW_NAMES, settings_of
+from acwm_report.plan_page import write_plan_page
 from tests import tiny
 
 FEW = ["planner.candidates=6", "planner.iterations=2", "planner.elites=3", "planner.horizon=2"]
@@ -48,7 +50,7 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert summary["planner"]["candidates"] == 6
     page = (folder / "index.html").read_text()
     assert all(f'src="videos/{row}-0000.mp4"' in page for row in ROW_NAMES)
-    assert "<td>still\n<td>0/2" in page
+    assert re.search(r">Nothing<.*?<td[^>]*>0/2<", page, re.DOTALL)
     videos = sorted(path.name for path in (folder / "videos").iterdir())
     assert videos == sorted(f"{row}-0000.{kind}" for row in ROW_NAMES for kind in ("mp4", "json"))
     assert summary["unit"] == "px"
@@ -110,8 +112,12 @@ def test_settings_that_a_task_declares_come_before_those_of_the_user():
 
 def test_the_page_shows_settings_that_make_the_same_plans_again(tmp_path):
     settings = settings_of(["planner.spread=null", "planner.warm_start=false", "past=1"])
-    page = write_page(tmp_path, "a plan", settings.to_dict(), [])
-    shown = re.search(r'<p class="quiet">(.*?)</p>', page.read_text(encoding="utf-8"))[1]
+    about = {"environment": "slide", "task": "place"}
+    write_json(tmp_path / "summary.json", PlanTable(**about, rows=[]))
+    write_json(tmp_path / "settings.json", {**about, **settings.to_dict()})
+    write_plan_page(tmp_path)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    shown = re.search(r"<code>(.*?)</code>", page)[1]
     assert "planner.spread=null" in shown
     assert settings_of(html.unescape(shown).split()) == settings
 
@@ -249,7 +255,7 @@ def test_a_plan_that_failed_at_once_leaves_its_folder_to_other_settings(mine, ca
     assert code == 0, err
     page = (mine / "planning" / "again" / "index.html").read_text(encoding="utf-8")
     assert " planner.horizon=2 " in page
-    assert "{" not in page.split("<h1>")[1]
+    assert "{" not in re.search(r"<h1>.*</main>", page, re.DOTALL)[0]
 
 
 def test_a_run_that_is_not_there(tmp_path, capsys, monkeypatch):

@@ -8,9 +8,12 @@ import pytest
 from scipy.stats import beta
 
 from acwm_core.errors import AcwmWarning, DataError
-from acwm_planning.commands import print_table
+from acwm_planning.results import PlanTable
 from acwm_planning.resumable import EPISODES_FILE, ResumableResults
-from acwm_planning.table import EpisodeLine, mcnemar, missing_episodes, summarise
+from acwm_planning.runner import missing_rows
+from acwm_planning.table import EpisodeLine, mcnemar, summarise
+from acwm_report.plans import plan_table
+from acwm_report.terminal import print_page_table
 
 
 def line(row, seed, success, **facts):
@@ -65,14 +68,10 @@ def test_finished_episodes_are_kept_and_the_cut_off_one_is_played_again(tmp_path
     again = ResumableResults(tmp_path / "out", {"task": "place", "steps": (1, 2)})
     assert [each["seed"] for each in again.finished()] == [0]
     rows = ("model", "still")
-    assert [*missing_episodes(rows, (0, 1), again.finished())] == [
-        ("still", 0),
-        ("model", 1),
-        ("still", 1),
-    ]
+    assert missing_rows(rows, (0, 1), again) == {0: ["still"], 1: ["model", "still"]}
     again.add(line("still", 0, False))
     again.add(line("model", 1, False))
-    assert [*missing_episodes(rows, (0, 1), again.finished())] == [("still", 1)]
+    assert missing_rows(rows, (0, 1), again) == {1: ["still"]}
 
 
 def test_results_of_other_settings_are_not_mixed(tmp_path):
@@ -115,6 +114,11 @@ def test_no_distance_is_below_zero():
 
 def test_the_printed_table_fits_a_terminal(capsys):
     more = {"seconds_per_decision": 12.345, "rollouts_per_decision": 4096.0}
-    rows = [line("simulator", seed, seed % 7 == 0, **more) for seed in range(50)]
-    print_table(summarise([line("model", seed, True, **more) for seed in range(50)] + rows))
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    lines = [line("model", seed, True, **more) for seed in range(50)]
+    for row in ("simulator", "codec"):
+        lines += [line(row, seed, seed % 7 == 0, **more) for seed in range(50)]
+    print_page_table(plan_table(PlanTable("slide", "place", summarise(lines), "px")))
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 80
+    for text in ("50/50", "8/50", "4096", "Clopper"):
+        assert text in printed

@@ -32,7 +32,7 @@ def solved(environment, task, index):
 class Replay(Driver):
     """Takes the scripted solution's actions, five at a time."""
 
-    def __init__(self, *, world_model, card, task, usual, steps):
+    def __init__(self, *, world_model, card, task, action_std, steps):
         self.name, self.task = card.name, task
 
     def begin(self, goal, still, seed):

@@ -13,8 +13,8 @@ import torch
 from click.testing import CliRunner
 
 from acwm_core.cli import main
+from acwm_core.data.pictures import to_pixels
 from acwm_core.errors import AcwmError, DataError, RecipeError
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.objectives.objective import drawn_noise
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
@@ -23,7 +23,7 @@ from acwm_core.training.run import load_run
 from acwm_play.export import episodes, graphs, page, runtime
 from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, export_graphs
 from acwm_play.layout import Pointing, physics_of
-from acwm_play.simulator import Scene, Simulator
+from acwm_play.simulator import SceneSpec, Simulator
 from acwm_play.worlds import playable
 from tests.browsing import DESK
 from tests.play import follower
@@ -347,7 +347,7 @@ def test_the_episodes_are_the_simulators(written):
     about = unpacked(folder, "about")
     simulator = Simulator("push_cube", SIZE)
     for episode in json.loads(about)["episodes"]:
-        time_steps = simulator.start(Scene(episode["index"]))
+        time_steps = simulator.start(SceneSpec(episode["index"]))
         time_steps += [simulator.step(np.array(row)) for row in episode["actions"]]
         frames = np.frombuffer(unpacked(folder, f"episode{episode['index']}"), np.uint8)
         truth = np.stack([time_step.frame for time_step in time_steps])

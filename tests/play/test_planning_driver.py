@@ -32,7 +32,9 @@ def bundle(tmp_path_factory):
 @pytest.fixture
 def driver(bundle):
     given = {"world_model": bundle.world_model, "card": bundle.card, "task": Quick()}
-    return catalog().component("driver", "planner").create_as(Driver, **given, usual=[0.5, 0.5])
+    return (
+        catalog().component("driver", "planner").create_as(Driver, **given, action_std=[0.5, 0.5])
+    )
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def test_it_decides_as_acwm_plan_does(bundle, driver, history):
     settings = settings_of([], declared=FEW)
     rollouts = ModelRollouts(bundle.world_model, bundle.card, None, **settings.rollouts())
     planned = PlanningController(
-        make_planner(settings), rollouts, make_cost(settings), usual=[0.5, 0.5]
+        make_planner(settings), rollouts, make_cost(settings), action_std=[0.5, 0.5]
     )
     planned.aim(Quick(), goal, bundle.card.action, still, 7)
     driver.begin(goal, still, 7)

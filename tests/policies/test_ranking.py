@@ -8,13 +8,13 @@ from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.files import read_json
 from acwm_core.training.run import load_run
-from acwm_planning.policies.commands import print_ranking
 from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
 from acwm_planning.policies.ranking import RANKING_FILE, Ranking
 from acwm_planning.policies.run import Ranker, rank_policies
 from acwm_planning.policies.scripted import ScriptedPolicy, built_in_policies
 from acwm_planning.policies.table import summarise
 from acwm_planning.resumable import ResumableResults
+from acwm_report.terminal import print_ranking
 from tests import tiny
 
 pytestmark = pytest.mark.ci
@@ -34,7 +34,7 @@ def ranked(tmp_path, model, policies=None, seeds=SEEDS):
     about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
     results = ResumableResults(tmp_path, about, ("policy", "seed"))
     for seed in seeds:
-        results.add(*ranker.lines(seed, ranker.names()))
+        results.add(*ranker.lines(seed, ranker.rows))
     return summarise(results)
 
 
@@ -102,7 +102,7 @@ def test_frames_that_are_given_stand_still_and_are_not_judged(tmp_path, parts):
     start = simulator(given=5).start(tiny.spec(1))
     assert start.frames.shape == (5, 32, 32, 3)
     assert (start.frames == start.frames[0]).all()
-    assert start.actions.shape == (4, 2)
+    assert np.shape(start.history.actions) == (4, 2)
     rows = [np.full((12, 2), 1.5, np.float32), np.full((12, 2), -1.0, np.float32)]
     made = ModelJudge(bundle.world_model, reader, tiny.PLACE).replay(start, rows)
     single = ModelJudge(
@@ -192,7 +192,7 @@ def test_an_estimator_that_reads_nothing_is_an_error_and_no_ranking(tmp_path, ex
     ranker = Ranker(simulator(), model, reader, policies, policies[0])
     about = {"environment": "slide", "task": "place", "unit": "px", "weights": None}
     results = ResumableResults(tmp_path, about, ("policy", "seed"))
-    results.add(*ranker.lines(0, ranker.names()))
+    results.add(*ranker.lines(0, ranker.rows))
     with pytest.raises(
         DataError, match=r"cannot read the distance .* 2 of 2 policies \(solution, beha"
     ):

@@ -13,13 +13,13 @@ from acwm_core.data.video import write_mp4
 from acwm_core.errors import AcwmWarning
 from acwm_core.evaluation.results import Summary, write_json
 from acwm_planning.policies.ranking import RANKING_FILE
+from acwm_planning.results import EpisodeCurves
+from acwm_planning.results import PlannedDistances as Expected
 from acwm_planning.table import summarise
-from acwm_planning.video import EpisodeCurves
-from acwm_planning.video import PlannedDistances as Expected
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
-from acwm_report.plan_videos import PlanCurves, PlanVideo, VideoRoom, plan_videos
+from acwm_report.plan_videos import PlanVideo, VideoRoom, plan_videos
 from acwm_report.plans import plan_tables
 from acwm_report.run import EvaluatedRun
 from tests.report import synthetic
@@ -96,8 +96,8 @@ def test_a_film_shows_where_the_plan_went_wrong(planned):
 
 def test_curves_are_those_of_the_file(planned):
     values = json.loads((planned / "planning/place/videos/model-0001.json").read_text())
-    curves = PlanCurves(**values | {"plans": [Expected(**each) for each in values["plans"]]})
-    drawn = PlanVideo("key", "place", curves, b"").drawing
+    curves = EpisodeCurves(**values | {"plans": [Expected(**each) for each in values["plans"]]})
+    drawn = PlanVideo("key", "place", curves, "").drawing
     assert drawn.top == "40.0 cm"
     assert drawn.tolerance == pytest.approx(1 - 0.05 / 0.4)
     assert drawn.happened == ["0.0000,0.0000 0.3333,0.2500 0.6667,0.2500 1.0000,0.1250"]

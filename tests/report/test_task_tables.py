@@ -46,7 +46,7 @@ def test_all_worlds_stand_in_one_table(two, tmp_path):
     page = write_report([], tmp_path / "page.html", experiment=read).read_text()
     assert page.count("<h3>All worlds</h3>") == 1
     for heading in ("One · place", "Two · place"):
-        assert f'colspan="7">{heading}</th>' in page
+        assert f'colspan="8">{heading}</th>' in page
     assert "What it is. Intervals of shares are exact" in page
     assert "Not played yet: Three." in page
     assert "45.0 cm" in page

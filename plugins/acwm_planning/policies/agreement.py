@@ -82,12 +82,13 @@ def agreement(judge: Scores, truth: Scores, seed: int = 0, resamples: int = RESA
     for _ in range(resamples if policies >= MIN_EPISODES else 0):
         rows = rng.integers(policies, size=policies)
         columns = rng.integers(episodes, size=episodes) if several else every
-        one, other = (each[rows][:, columns].mean(1) for each in (judge, truth))
+        pair = (scores[rows][:, columns].mean(1) for scores in (judge, truth))
+        means = tuple(pair)
         for name, statistic in STATISTICS.items():
-            samples[name].append(statistic(one, other))
+            samples[name].append(statistic(*means))
     values = {
-        name: _estimate(each(judge.mean(1), truth.mean(1)), np.array(samples[name]))
-        for name, each in STATISTICS.items()
+        name: _estimate(statistic(judge.mean(1), truth.mean(1)), np.array(samples[name]))
+        for name, statistic in STATISTICS.items()
     }
     return Agreement(**values)
 
@@ -116,8 +117,8 @@ def decisions(judge: list[Scores], truth: list[Scores]) -> Decisions:
     """Regrets of choices at many starts, with intervals over the starts."""
     regrets = np.array([regret(*pair) for pair in zip(judge, truth, strict=True)]).reshape(-1, 2)
     lost, chance, gain = (
-        with_interval(float(each.mean()), [each])
-        for each in (regrets[:, 0], regrets[:, 1], regrets[:, 1] - regrets[:, 0])
+        with_interval(float(values.mean()), [values])
+        for values in (regrets[:, 0], regrets[:, 1], regrets[:, 1] - regrets[:, 0])
     )
     regret_bounds = 0.0, math.inf
     return Decisions(len(regrets), within(lost, regret_bounds), within(chance, regret_bounds), gain)

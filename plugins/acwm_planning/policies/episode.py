@@ -9,29 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
-from acwm_core.env.task import Frame, Goal, Task, judged
-
-
-@dataclass(frozen=True)
-class Start:
-    """The start of an episode, from which policies act.
-
-    Attributes:
-        spec: spec of the episode.
-        frames: context frames for a model, `[K, H, W, 3]`; nothing moves in them, and the last one
-            is the current frame.
-        actions: raw actions between the frames, `[K − 1, A]`.
-        goal: goal of the episode.
-        distance: true distance from the goal.
-    """
-
-    spec: EpisodeSpec
-    frames: NDArray[np.uint8]
-    actions: NDArray[np.float32]
-    goal: Goal
-    distance: float
+from acwm_core.env.task import Task, judged
+from acwm_planning.episode import EpisodeResult, Start
 
 
 @dataclass(frozen=True)
@@ -68,33 +48,26 @@ def compute_outcome(
         success: whether each frame shows success, `[T]`.
         start: start of the episode.
     """
-    known = np.concatenate([[start.distance], distances])
-    last = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(len(known)), 0))
+    values = np.concatenate([[start.distance], distances])
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     steps = int(success.argmax()) + 1 if success.any() else len(success)
-    counted = known[last][1 : steps + 1]
+    counted = values[last][1 : steps + 1]
     unread = not np.isfinite(distances).any()
     return Outcome(bool(success.any()), -float(counted.sum()), steps, float(counted[-1]), unread)
 
 
-def read_outcome(seen: Observation, task: Task, start: Start) -> Outcome:
+def read_outcome(observation: Observation, task: Task, start: Start) -> Outcome:
     """Compute the outcome of T frames that an estimator has read."""
-    distances, success = (judged(task, each, seen, start.goal) for each in ("distance", "success"))
+    distances, success = (
+        judged(task, method, observation, start.goal) for method in ("distance", "success")
+    )
     return compute_outcome(distances.astype(np.float64), success, start)
 
 
-@dataclass(frozen=True)
-class PolicyEpisode:
-    """An episode that was played in the true simulator.
-
-    Attributes:
-        frames: the frame after each action, `[H, W, 3]` each.
-        actions: raw actions, `[T, A]`.
-        outcome: outcome from the simulator's true states.
-    """
-
-    frames: list[Frame]
-    actions: NDArray[np.float32]
-    outcome: Outcome
+def true_outcome(result: EpisodeResult, start: Start) -> Outcome:
+    """Compute the outcome of an episode that was played in the true simulator."""
+    distances = np.array(result.distances[1:], np.float64)
+    return compute_outcome(distances, np.array(result.successes), start)
 
 
 def join_observations(parts: list[Observation]) -> Observation:

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from acwm_core.env.environment import Environment, Policy
+from acwm_core.data.pictures import to_pixels
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation, StateEstimator
-from acwm_core.env.task import Frame, Goal, Task, TaskEnvironment
+from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import noting
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.videos import to_pixels
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
+from acwm_planning.controllers import Controller, PolicyController
+from acwm_planning.episode import EpisodeResult, Start, play, start_of
 from acwm_planning.policies.episode import (
     Outcome,
-    PolicyEpisode,
-    Start,
-    compute_outcome,
     join_observations,
     read_outcome,
+    true_outcome,
 )
-from acwm_planning.policies.own import OwnPolicy
+from acwm_planning.policies.own import OwnController, OwnPolicy
 
 
 class Judge(ABC):
@@ -70,61 +70,28 @@ class SimulatorJudge(Judge):
 
     def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> Start:
         """Start an episode, with its own goal or with a given one."""
-        options = {"spec": spec, **({} if goal is None else {"goal": goal})}
         with noting(f"in episode {spec.index} of {spec.split}", *self._parts):
-            frame, info = self.environment.reset(options=options)
-            frames, actions = [frame], list[NDArray[np.float32]]()
-            for _ in range(self._given - 1):
-                actions.append(self.environment.environment.still_action())
-                frame, _, _, _, info = self.environment.step(actions[-1])
-                frames.append(frame)
-        size = self.environment.environment.card.action.size
-        between = np.array(actions, np.float32).reshape(-1, size)
-        goal = self.environment.goal
-        return Start(spec, np.stack(frames), between, goal, float(info["distance"]))
+            return start_of(self.environment, spec, given=self._given, goal=goal)
 
-    def play(
-        self, start: Start, begin: Callable[[Environment], Policy], steps: int
-    ) -> PolicyEpisode:
-        """Play one episode with a policy that looks at the simulator."""
-        self.start(start.spec, start.goal)
-        with noting(f"in episode {start.spec.index} of {start.spec.split}", *self._parts):
-            return self._go_on(start, begin(self.environment.environment), steps)
+    def play(self, start: Start, controller: Controller, steps: int) -> EpisodeResult:
+        """Play an episode from this start, with so many actions."""
+        spec = start.history.spec
+        return play(
+            self.environment, spec, controller, steps=steps, given=self._given, goal=start.goal
+        )
+
+    def play_own(self, start: Start, policy: OwnPolicy, steps: int) -> EpisodeResult:
+        """Play an episode with a user's policy, which observes true frames."""
+        return self.play(start, OwnController(policy, self._estimator, self._stride), steps)
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        return [
-            self.play(start, lambda _, rows=rows: iter(rows).__next__, len(rows)).outcome
-            for rows in actions
-        ]
+        replays = (
+            self.play(start, PolicyController.replaying(rows), len(rows)) for rows in actions
+        )
+        return [true_outcome(result, start) for result in replays]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        return self.play_own(start, policy, steps).outcome
-
-    def play_own(self, start: Start, policy: OwnPolicy, steps: int) -> PolicyEpisode:
-        """As `perform`, with all frames and actions."""
-        self.start(start.spec, start.goal)
-        self._frame = start.frames[-1]
-        policy.reset(start.goal)
-        block: list[NDArray[np.float32]] = []
-
-        def act() -> NDArray[np.float32]:
-            if not block:
-                block.extend([decision(policy, self._frame, self._estimator)] * self._stride)
-            return block.pop()
-
-        return self._go_on(start, act, steps)
-
-    def _go_on(self, start: Start, act: Policy, steps: int) -> PolicyEpisode:
-        frames: list[Frame] = []
-        actions, distances, success = list[NDArray[np.float32]](), list[float](), list[bool]()
-        for _ in range(steps):
-            actions.append(np.asarray(act(), np.float32))
-            self._frame, _, _, _, info = self.environment.step(actions[-1])
-            frames.append(self._frame)
-            distances.append(info["distance"])
-            success.append(info["success"])
-        outcome = compute_outcome(np.array(distances, np.float64), np.array(success), start)
-        return PolicyEpisode(frames, np.stack(actions), outcome)
+        return true_outcome(self.play_own(start, policy, steps), start)
 
 
 class ModelJudge(Judge):
@@ -158,12 +125,14 @@ class ModelJudge(Judge):
         return outcomes
 
     def _replay_batch(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:
-        number, known = len(rows), len(start.frames)
+        number, known = len(rows), len(start.history.frames)
         last = np.zeros_like(rows[:, :1])  # no frame follows it
-        between = np.broadcast_to(start.actions, (number, *start.actions.shape))
+        frames, actions = self._given(start)
+        between = actions.expand(number, -1, -1).numpy()
         inputs = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
-        given = self._given(start).expand(number, -1, -1, -1, -1)
-        seeds, observations = [start.spec.index] * number, list[list[Observation]]()
+        given = frames.expand(number, -1, -1, -1, -1)
+        seeds = [start.history.spec.index] * number
+        observations = list[list[Observation]]()
         with noting(_when(start), *self._world.children()):
             chunks = self._world.rollout_chunks(given, inputs, steps=self._steps, seeds=seeds)
             for chunk in chunks:
@@ -178,14 +147,13 @@ class ModelJudge(Judge):
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
         """The policy decides once per latent frame."""
-        between = torch.from_numpy(start.actions)[None].to(self._device)
-        stream = self._world.stream(
-            self._given(start), between, steps=self._steps, seeds=[start.spec.index]
-        )
+        given, between = self._given(start)
+        seeds = [start.history.spec.index]
+        stream = self._world.stream(given, between.to(self._device), steps=self._steps, seeds=seeds)
         policy.reset(start.goal)
         frame, stride, observations = stream.given[0, -1], self._world.codec.temporal_stride, []
         for _ in range(0, steps, stride):
-            action = decision(policy, to_pixels(frame[None])[0], self._estimator)
+            action = policy.decide(to_pixels(frame[None])[0], self._estimator)
             rows = torch.from_numpy(np.stack([action] * stride))[None].to(self._device)
             with noting(_when(start), *self._world.children()):
                 frames = stream.step(rows)[0]
@@ -199,20 +167,14 @@ class ModelJudge(Judge):
     def _device(self) -> torch.device:
         return self._world.action_low.device
 
-    def _given(self, start: Start) -> Video:
-        return as_clip(start.frames)[None].to(self._device)
+    def _given(self, start: Start) -> tuple[Video, Tensor]:
+        """Context frames on the model's device, and the raw actions between them on the CPU."""
+        actions = np.array(start.history.actions, np.float32).reshape(
+            -1, len(self._world.action_low)
+        )
+        return as_clip(start.frames)[None].to(self._device), torch.from_numpy(actions)[None]
 
 
 def _when(start: Start) -> str:
-    return f"in episode {start.spec.index} of {start.spec.split}, while the model predicts"
-
-
-def decision(
-    policy: OwnPolicy, frame: Frame, estimator: StateEstimator | None
-) -> NDArray[np.float32]:
-    """The action of a policy that observes a frame, or the states read from it."""
-    state = None
-    if policy.observes == "state" and estimator is not None:
-        seen = estimator.read(as_clip(frame[None]))
-        state = {name: values[0] for name, values in seen.states.items()}
-    return policy.act(frame.copy(), state)  # the policy may modify the frame
+    spec = start.history.spec
+    return f"in episode {spec.index} of {spec.split}, while the model predicts"

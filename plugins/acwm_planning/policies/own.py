@@ -10,10 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.task import Frame, Goal
+from acwm_core.env.environment import Environment, EnvironmentCard
+from acwm_core.env.physics import StateEstimator
+from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import PluginError, RecipeError, noting
+from acwm_core.evaluation.clips import as_clip
 from acwm_core.recipe.trust import import_named
+from acwm_planning.controllers import Actions, Controller
+from acwm_planning.futures import History
 
 
 class OwnPolicy:
@@ -84,9 +88,36 @@ class OwnPolicy:
             )
         return np.clip(action.astype(np.float32), spec.low, spec.high, dtype=np.float32)
 
+    def decide(self, frame: Frame, estimator: StateEstimator | None) -> NDArray[np.float32]:
+        """The next action for a frame, of which an estimator reads the states if it needs them."""
+        state = None
+        if self.observes == "state" and estimator is not None:
+            seen = estimator.read(as_clip(frame[None]))
+            state = {name: values[0] for name, values in seen.states.items()}
+        return self.act(frame.copy(), state)  # the policy may modify the frame
+
     def _call(self, doing: str, function: Any, *arguments: Any) -> Any:
         with noting(f"when the policy {self.name} was {doing}", self.name):
             return function(*arguments)
+
+
+class OwnController(Controller):
+    """Lets a user's policy act in the simulator.
+
+    Args:
+        policy: the policy.
+        estimator: reads the states for it.
+        stride: number of actions for which its action is held.
+    """
+
+    def __init__(self, policy: OwnPolicy, estimator: StateEstimator | None, stride: int) -> None:
+        self._policy, self._estimator, self._stride = policy, estimator, stride
+
+    def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
+        self._policy.reset(goal)
+
+    def act(self, history: History) -> Actions:
+        return [self._policy.decide(history.frames[-1], self._estimator)] * self._stride
 
 
 def is_finite(numbers: NDArray[Any]) -> bool:

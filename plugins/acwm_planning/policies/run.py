@@ -1,11 +1,10 @@
-"""Rolls out policies for a run and a task, and writes a ranking."""
+"""Rolls out the policies of `acwm rank`, and writes a ranking."""
 
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,12 @@ from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.score import estimator_for
-from acwm_core.executors import duration, progress_bar
-from acwm_core.plugins import catalog
+from acwm_core.executors import duration
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
-from acwm_planning.episode import spec_of_seed
-from acwm_planning.left_out import LeftOut, passed_over
-from acwm_planning.policies.episode import Outcome, PolicyEpisode, Start, read_outcome
+from acwm_planning.controllers import PolicyController
+from acwm_planning.episode import EpisodeResult, Start, load_task, spec_of_seed
+from acwm_planning.policies.episode import Outcome, read_outcome, true_outcome
 from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.ranking import RANKING_FILE, Ranking
@@ -41,6 +39,7 @@ from acwm_planning.policies.scripted import (
 )
 from acwm_planning.policies.table import DECISION, DecisionLine, PolicyLine, summarise
 from acwm_planning.resumable import Line, ResumableResults
+from acwm_planning.runner import EpisodeTable, play_missing
 
 SCRIPTED = "scripted"
 """Stands for all built-in scripted policies."""
@@ -52,7 +51,7 @@ BRANCHES = ("another", "still", "reversed", "mirrored")
 """Alternatives to a start's own actions in a decision; see `plan_branches`."""
 
 
-class Ranker:
+class Ranker(EpisodeTable):
     """Rolls out policies in the true simulator and in a model of it.
 
     Args:
@@ -60,10 +59,7 @@ class Ranker:
         model: the model that is compared with it.
         estimator: also reads the true frames, which shows the effect of its own errors.
         policies: policies to roll out.
-        script: policy whose actions the decisions choose from.
-
-    Attributes:
-        left: what failed, and is left out.
+        script: policy whose actions the decisions choose from; they have a row of their own.
     """
 
     def __init__(
@@ -74,19 +70,16 @@ class Ranker:
         policies: Sequence[ScriptedPolicy | OwnPolicy],
         script: ScriptedPolicy,
     ) -> None:
-        self.policies, self._script, self.left = list(policies), script, LeftOut()
+        super().__init__([*(policy.name for policy in policies), DECISION])
+        self.policies, self._script = list(policies), script
         self._simulator, self._model, self._estimator = simulator, model, estimator
         self._environment = simulator.environment
         self._steps = self._environment.task.max_steps
 
-    def names(self) -> list[str]:
-        """Names of everything that is rolled out from a start: the policies, and the decision."""
-        return [*(policy.name for policy in self.policies), DECISION]
-
-    def seconds(self, seeds: Sequence[int]) -> float:
-        """How long all takes from a start, about, as playing and predicting one sequence takes."""
+    def estimate(self, missing: Mapping[int, Sequence[str]]) -> str:
+        """As playing and predicting one sequence takes."""
         card, batch = self._environment.environment.card, self._model.batch
-        start = first_start(self._simulator, card, seeds)
+        start = first_start(self._simulator, card, [*missing])
         began = time.perf_counter()
         actions = self._play(start, self._script).actions
         played = time.perf_counter()
@@ -94,59 +87,64 @@ class Ranker:
         self._model.replay(start, [actions] * min(batch, rows))
         predicted = time.perf_counter() - played
         plays = len(self.policies) + 2 + 1 + len(BRANCHES)  # those of a decision are played again
-        return plays * (played - began) + -(-rows // batch) * predicted
+        seconds = plays * (played - began) + -(-rows // batch) * predicted
+        return f"about {duration(len(missing) * seconds)} for {len(missing)} starts"
 
-    def lines(self, seed: int, names: Sequence[str]) -> list[Line]:
-        """Results for some of `names`, from the start of a seed, without those that fail."""
+    def lines(self, seed: int, rows: Sequence[str]) -> list[Line]:
         start = self._simulator.start(spec_of_seed(self._environment.environment.card, seed))
-        chosen = [policy for policy in self.policies if policy.name in names]
-        episodes: dict[str, PolicyEpisode] = {}
-        for policy in (each for each in chosen if isinstance(each, ScriptedPolicy)):
+        policies = [policy for policy in self.policies if policy.name in rows]
+        episodes: dict[str, EpisodeResult] = {}
+        scripted = [policy for policy in policies if isinstance(policy, ScriptedPolicy)]
+        for policy in scripted:
             with self.left.trying(policy.name, seed):
                 episodes[policy.name] = self._play(start, policy)
         branches: list[tuple[str, NDArray[np.float32]]] = []
-        if DECISION in names:
+        if DECISION in rows:
             with self.left.trying(DECISION, seed):
                 branches = self._branches(start, seed)
-        rows = [each.actions for each in episodes.values()] + [rows for _, rows in branches]
-        outcomes = self._model.replay(start, rows) if rows else []
+        actions = [episode.actions for episode in episodes.values()]
+        actions += [alternative for _, alternative in branches]
+        outcomes = self._model.replay(start, actions) if actions else []
         lines: list[Line] = []
-        for (name, true), seen in zip(episodes.items(), outcomes, strict=False):
-            lines.append(self._line(name, seed, "open", start, true, seen))
-        for policy in (each for each in chosen if isinstance(each, OwnPolicy)):
+        for (name, episode), outcome in zip(episodes.items(), outcomes, strict=False):
+            lines.append(self._line(name, seed, "open", start, episode, outcome))
+        own = [policy for policy in policies if isinstance(policy, OwnPolicy)]
+        for policy in own:
             with self.left.trying(policy.name, seed):
-                true = self._simulator.play_own(start, policy, self._steps)
-                seen = self._model.perform(start, policy, self._steps)
-                lines.append(self._line(policy.name, seed, "closed", start, true, seen))
+                episode = self._simulator.play_own(start, policy, self._steps)
+                outcome = self._model.perform(start, policy, self._steps)
+                lines.append(self._line(policy.name, seed, "closed", start, episode, outcome))
         if branches:
             lines.append(self._decision(start, seed, branches, outcomes[len(episodes) :]))
         return lines
 
-    def _play(self, start: Start, policy: ScriptedPolicy) -> PolicyEpisode:
-        task, goal = self._environment.task, start.goal
-        return self._simulator.play(start, lambda env: policy.begin(env, task, goal), self._steps)
+    def _play(self, start: Start, policy: ScriptedPolicy) -> EpisodeResult:
+        return self._simulator.play(start, PolicyController(policy.begin), self._steps)
 
-    def _read(self, start: Start, true: PolicyEpisode) -> Outcome:
-        seen = self._estimator.read(as_clip(np.stack(true.frames)))
-        return read_outcome(seen, self._environment.task, start)
+    def _judge(self, start: Start, episode: EpisodeResult, model: Outcome) -> dict[str, Outcome]:
+        """The outcome of an episode by judge: the truth, the estimator, and the model."""
+        observation = self._estimator.read(as_clip(episode.frames))
+        read = read_outcome(observation, self._environment.task, start)
+        return {"truth": true_outcome(episode, start), "estimator": read, "model": model}
 
     def _line(
-        self, name: str, seed: int, loop: str, start: Start, true: PolicyEpisode, seen: Outcome
+        self, name: str, seed: int, loop: str, start: Start, episode: EpisodeResult, model: Outcome
     ) -> Line:
-        facts = {"policy": name, "seed": seed, "loop": loop, "truth": true.outcome.facts()}
-        return {**facts, "estimator": self._read(start, true).facts(), "model": seen.facts()}
+        judges = self._judge(start, episode, model)
+        facts = {judge: outcome.facts() for judge, outcome in judges.items()}
+        return {"policy": name, "seed": seed, "loop": loop, **facts}
 
     def _branches(self, start: Start, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
         """The script's own actions and their alternatives, `[T, A]` each."""
         card = self._environment.environment.card
         other = first_start(self._simulator, card, range(seed + 1, seed + 1 + TRIED_SEEDS))
-        rows = [self._play(each, self._script).actions for each in (other, start)]
-        self._simulator.start(start.spec, start.goal)
+        episodes = [self._play(place, self._script) for place in (other, start)]
+        another, own = (np.pad(episode.actions, ((0, 1), (0, 0))) for episode in episodes)
+        self._simulator.start(start.history.spec, start.goal)
         inner = self._environment.environment
-        another, own = (np.concatenate([each, np.zeros_like(each[:1])]) for each in rows)
-        alternatives = plan_branches(own, another, inner.still_action(), inner.card.action)
-        pairs = [(each.kind, each.actions[:-1]) for each in alternatives if each.kind in BRANCHES]
-        return [("own", own[:-1]), *pairs]
+        planned = plan_branches(own, another, inner.still_action(), inner.card.action)
+        branches = [(branch.kind, branch.actions[:-1]) for branch in planned]
+        return [("own", own[:-1]), *(branch for branch in branches if branch[0] in BRANCHES)]
 
     def _decision(
         self,
@@ -156,11 +154,12 @@ class Ranker:
         outcomes: Sequence[Outcome],
     ) -> Line:
         choices: list[dict[str, Any]] = []
-        for (kind, rows), seen in zip(branches, outcomes, strict=True):
-            true = self._simulator.play(start, lambda _, r=rows: iter(r).__next__, len(rows))
-            judges = {"truth": true.outcome, "estimator": self._read(start, true), "model": seen}
-            each = {name: result.returns / self._steps for name, result in judges.items()}
-            choices.append({"kind": kind, **each})
+        for (kind, actions), model in zip(branches, outcomes, strict=True):
+            controller = PolicyController.replaying(actions)
+            episode = self._simulator.play(start, controller, len(actions))
+            judges = self._judge(start, episode, model)
+            returns = {judge: outcome.returns / self._steps for judge, outcome in judges.items()}
+            choices.append({"kind": kind, **returns})
         return {"policy": DECISION, "seed": seed, "branches": choices}
 
 
@@ -188,30 +187,31 @@ def rank_policies(
         progress: show a progress bar.
     """
     bundle, weights = load_run(run), file_sha256(RunFolder(find_run(run)).weights)
-    goal_task: Task = catalog().component("environment", bundle.card.name).load_task(task)
-    estimator = estimator_for(bundle.card)
+    card, goal_task = bundle.card, load_task(bundle.card.name, task)
+    estimator = estimator_for(card)
     if estimator is None:
         raise DataError(
-            f"no estimator reads the states of {bundle.card.name} from pictures, so what a model "
-            "predicts cannot be judged"
+            f"no estimator reads the states of {card.name} from pictures, so what a model predicts "
+            "cannot be judged"
         )
     world = bundle.world_model.to(choose_device(device))
-    inner = make_environment(bundle.card.name, {"size": bundle.card.frame_size})
+    inner = make_environment(card.name, {"size": card.frame_size})
     try:
         environment = TaskEnvironment(inner, goal_task)
         stride = world.codec.temporal_stride
         simulator = SimulatorJudge(environment, world.context_frames, stride, estimator)
-        solved = is_solvable(inner, goal_task, first_start(simulator, bundle.card, seeds).goal)
-        chosen = _parse_policies(policies, solved, goal_task, bundle.card)
+        solved = is_solvable(inner, goal_task, first_start(simulator, card, seeds).goal)
+        chosen = _parse_policies(policies, solved, goal_task, card)
         script = ScriptedPolicy("solution" if solved else "behaviour")
         model = ModelJudge(world, estimator, goal_task, steps=steps)
         ranker = Ranker(simulator, model, estimator, chosen, script)
-        identity = {"environment": bundle.card.name, "task": task, "unit": goal_task.unit}
+        identity = {"environment": card.name, "task": task, "unit": goal_task.unit}
         settings = {"steps": steps, "weights": weights, "estimator": dict(estimator.provenance())}
         keys, kind = ("policy", "seed"), PolicyLine | DecisionLine
         results = ResumableResults(out, {**identity, **settings}, keys, kind)
         with results.adding():
-            _roll_out(ranker, results, seeds, progress)
+            label = f"ranking at {task}" if progress else ""
+            play_missing(ranker, results, seeds, progress=label)
             ranking = summarise(results)
             write_json(out / RANKING_FILE, ranking)
             return ranking
@@ -244,24 +244,3 @@ def _parse_policies(
                 )
             parsed[policy.name] = policy
     return [*parsed.values()]
-
-
-def _roll_out(
-    ranker: Ranker, results: ResumableResults, seeds: Sequence[int], progress: bool
-) -> None:
-    finished = {(str(line["policy"]), int(line["seed"])) for line in results.finished()}
-    missing = {seed: [n for n in ranker.names() if (n, seed) not in finished] for seed in seeds}
-    total, count = len(seeds) * len(ranker.names()), sum(map(len, missing.values()))
-    what = f"ranking at {results.settings['task']}"
-    with progress_bar(what, total, done=total - count, shown=progress) as advance:
-        left = [seed for seed, names in missing.items() if names]
-        if progress and left:
-            with passed_over():
-                about = duration(len(left) * ranker.seconds(left))
-                print(f"about {about} for {len(left)} starts", file=sys.stderr, flush=True)
-        for seed in left:
-            with ranker.left.trying("every policy", seed):
-                results.add(*ranker.lines(seed, missing[seed]))
-            advance(len(missing[seed]))
-    if ranker.left.error and not results.finished():
-        raise ranker.left.error

@@ -12,11 +12,12 @@ import numpy as np
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import PluginError, RecipeError, check_shape, suggest
+from acwm_core.errors import PluginError, RecipeError, suggest
+from acwm_planning.scripts import NoSolutionError, Script
 
-Script = Literal["solution", "behaviour"]
+ScriptName = Literal["solution", "behaviour"]
 
-SCRIPTS: tuple[Script, ...] = ("solution", "behaviour")
+SCRIPTS: tuple[ScriptName, ...] = ("solution", "behaviour")
 """The task's own solution; and the behaviour policy of the data, which does not know the goal."""
 
 HOLD = 5
@@ -39,7 +40,7 @@ class ScriptedPolicy:
         script: one of `SCRIPTS`.
     """
 
-    script: Script
+    script: ScriptName
     skill: float = 1.0
     noise: float = 0.0
     bias: float = 0.0
@@ -47,11 +48,11 @@ class ScriptedPolicy:
     @property
     def name(self) -> str:
         """The name by which it is requested, e.g. ``solution,skill=0.7,noise=0.3``."""
-        usual = ScriptedPolicy(self.script)
+        default = ScriptedPolicy(self.script)
         words = [
-            f"{each}={getattr(self, each):g}"
-            for each in ("skill", "noise", "bias")
-            if getattr(self, each) != getattr(usual, each)
+            f"{name}={getattr(self, name):g}"
+            for name in ("skill", "noise", "bias")
+            if getattr(self, name) != getattr(default, name)
         ]
         return ",".join([self.script, *words])
 
@@ -59,29 +60,22 @@ class ScriptedPolicy:
         """Create the policy of an episode that starts at the environment's current state.
 
         Raises:
-            RecipeError: the task has no solution.
+            NoSolutionError: the task has no solution.
         """
         spec, action = environment.episode_spec, environment.card.action
-        solves = self.script == "solution"
-        owner, method = (task, "solution") if solves else (environment, "policy")
-        if solves:
-            act = task.solution(environment, goal, spec.rng("policy"))
-        else:
-            act = environment.policy(spec.rng("policy"))
-        if act is None:
-            raise RecipeError(f"the task {task.name!r} has no scripted solution")
-        script, rng = act, spec.rng(f"policy:{self.name}")
+        script = Script.begin(environment, task, goal, solves=self.script == "solution")
+        rng = spec.rng(f"policy:{self.name}")
         low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
         side = EpisodeSpec(environment.card.name).rng("bias").choice([-1.0, 1.0], len(low))
         samples = (rng.uniform(-1, 1, len(low)) for _ in itertools.count())
-        noise = (each for each in samples for _ in range(HOLD))
+        noise = (sample for sample in samples for _ in range(HOLD))
 
         def disturbed() -> np.ndarray:
             still = environment.still_action()
-            intended = np.asarray(script(), np.float64)
-            check_shape(owner, method, intended, len(low))
+            intended = script.act().astype(np.float64)
             if not np.isfinite(intended).all():
-                raise PluginError(f"{type(owner).__name__}.{method} gives numbers not finite")
+                owner = type(script.owner).__name__
+                raise PluginError(f"{owner}.{script.method} gives numbers not finite")
             pushed = self.noise * next(noise) + self.bias * side
             raw = still + self.skill * (intended - still) + pushed * (high - low) / 2
             return np.clip(raw.astype(np.float32), low, high)
@@ -98,13 +92,13 @@ def built_in_policies(solvable: bool) -> list[ScriptedPolicy]:
     if not solvable:
         skills, noises, biases = (1, 0.75, 0.5, 0.25, 0, -0.5), (0, 0.3), (0, 0.15)
         grid = itertools.product(skills, noises, biases)
-        return [ScriptedPolicy("behaviour", *each) for each in grid]
+        return [ScriptedPolicy("behaviour", *levels) for levels in grid]
     good = itertools.product((1, 0.7, 0.4, 0.2), (0, 0.3), (0, 0.15))
     poor = itertools.product((0, -0.4), (0, 0.3))
     blind = itertools.product((1, 0.5), (0, 0.3))
     return [
-        *(ScriptedPolicy("solution", *each) for each in (*good, *poor)),
-        *(ScriptedPolicy("behaviour", *each) for each in blind),
+        *(ScriptedPolicy("solution", *levels) for levels in (*good, *poor)),
+        *(ScriptedPolicy("behaviour", *levels) for levels in blind),
     ]
 
 
@@ -127,10 +121,13 @@ def parse_policy(text: str) -> ScriptedPolicy:
                 "bias=NUMBER, each once"
             )
         values[match[1]] = float(match[2])
-    return ScriptedPolicy(cast(Script, script), **values)
+    return ScriptedPolicy(cast(ScriptName, script), **values)
 
 
 def is_solvable(environment: Environment, task: Task, goal: Goal) -> bool:
     """Whether the task has a scripted solution from the environment's current state."""
-    rng = environment.episode_spec.rng("policy")
-    return task.solution(environment, goal, rng) is not None
+    try:
+        Script.begin(environment, task, goal, solves=True)
+    except NoSolutionError:
+        return False
+    return True

@@ -124,7 +124,7 @@ def _policies(
         )
         for row, (name, of) in enumerate(by_policy.items())
     ]
-    return sorted(policies, key=lambda each: (-each.success["truth"], -each.returns["truth"]))
+    return sorted(policies, key=lambda scores: (-scores.success["truth"], -scores.returns["truth"]))
 
 
 def _unread(lines: Mapping[int, Line], seeds: Sequence[int]) -> dict[str, int]:

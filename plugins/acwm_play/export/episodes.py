@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_play.layout import Pointing
-from acwm_play.simulator import Scene, Simulator
+from acwm_play.simulator import SceneSpec, Simulator
 
 EPISODE_COUNT = 4
 EPISODE_SECONDS = 12.0
@@ -52,7 +52,7 @@ def record(simulator: Simulator, index: int, given: int, stride: int) -> Recorde
         stride: video frames per latent frame; the episode ends with a whole latent frame.
     """
     latent_frames = round(EPISODE_SECONDS * simulator.card.fps / stride)
-    time_steps = simulator.start(Scene(index), given)
+    time_steps = simulator.start(SceneSpec(index), given)
     stills = [simulator.still()] * given
     for _ in range(stride * latent_frames):
         time_steps.append(simulator.step_by_policy(anew=False))

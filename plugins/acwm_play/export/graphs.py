@@ -127,14 +127,14 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
     begin = given, *_draw(world, seed=0)
     with torch.no_grad():
         latent, *state = Start(world)(*begin)
-        state = [each.clone() for each in state]  # a tensor given twice would be one input
+        state = [tensor.clone() for tensor in state]  # one given twice would be one input
         states = [f"state_{k}" for k in range(len(state))]
-        moved = [f"next_{each}" for each in states]
-        graph, shown = _graph, (latent, *_reference(world, given))
+        outputs = ["latent", *(f"next_{name}" for name in states)]
+        graph, decoded = _graph, (latent, *_reference(world, given))
         return {
             "start": graph(Start(world), begin, ["given", "noise"], ["latent", *states]),
-            "step": graph(Step(world), (actions, *state), ["actions", *states], ["latent", *moved]),
-            "decode": graph(Decode(world), shown, ["latent", "reference"], ["first", "frames"]),
+            "step": graph(Step(world), (actions, *state), ["actions", *states], outputs),
+            "decode": graph(Decode(world), decoded, ["latent", "reference"], ["first", "frames"]),
         }
 
 
@@ -162,7 +162,7 @@ def _check_exportable(world: WorldModel) -> None:
         why = f"a {name} cannot be exported: choose a model without sampling, such as recurrent"
     elif not world.codec.memoryless:
         why = f"a {type(world.codec).__name__} decodes with a memory, which is not exported"
-    elif sum(each.numel() for each in world.parameters()) > MAX_PARAMETERS:
+    elif sum(weight.numel() for weight in world.parameters()) > MAX_PARAMETERS:
         why = f"this model has more than {MAX_PARAMETERS:,} parameters, too many for a page"
     elif torch.__version__ < NEEDS_TORCH:
         why = (
@@ -239,7 +239,7 @@ class OnnxStream:
 
     def _run(self, name: str, *values: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         session = self._sessions[name]
-        names = [each.name for each in session.get_inputs()]
+        names = [argument.name for argument in session.get_inputs()]
         return cast(Any, session.run(None, dict(zip(names, values, strict=False))))
 
 
@@ -262,7 +262,7 @@ def check(
     """
     still = world.action_low.expand(1, len(given) - 1, -1)
     truth = world.stream(torch.from_numpy(given)[None], still, seeds=[0])
-    draw = [each.numpy() for each in _draw(world, seed=0)]
+    draw = [noise.numpy() for noise in _draw(world, seed=0)]
     stream, stride = OnnxStream(graphs, given, draw), world.codec.temporal_stride
     worst = float(np.abs(stream.given - truth.given[0, -1].numpy()).max())
     for start in range(0, len(actions), stride):

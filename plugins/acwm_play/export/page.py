@@ -118,7 +118,7 @@ def _write(folder: Path, parts: Mapping[str, bytes]) -> None:
         shutil.copy(PAGE / name, folder / name)
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     scripts = [*(f"data/{name}.js" for name in parts), *SCRIPTS]
-    loads = "\n".join(f'<script src="{each}" defer></script>' for each in scripts)
+    loads = "\n".join(f'<script src="{script}" defer></script>' for script in scripts)
     for old, new in (
         (SERVED, loads),
         ('<body class="busy">', '<body class="exported recorded busy">'),

@@ -1,4 +1,4 @@
-"""`acwm plan`: act in the true simulator by planning with a model."""
+"""`acwm plan` and `acwm rank`: act with a model in the simulator, and show what it is worth."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, seeds_of
+from acwm_report.terminal import print_page_table, print_ranking
 
 if TYPE_CHECKING:
     from acwm_planning.resumable import Line
     from acwm_planning.settings import Settings
-    from acwm_planning.table import RowSummary
 
 
 @click.command()
@@ -65,7 +65,6 @@ def plan(
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)
 
-    from acwm_core.executors import progress_bar
     from acwm_planning.run import declared_settings, plan_episodes
 
     declared = declared_settings(run, task)
@@ -83,26 +82,26 @@ def plan(
         rows = tuple(row for row in ROW_NAMES if row not in ("simulator", "codec"))
     chosen = settings.rows(rows or (ROW_NAMES if compare else ("model",)))
 
-    with progress_bar(f"planning {task}", len(seeds) * len(chosen)) as advance:
+    from acwm_report.plan_page import write_plan_page
 
-        def report(line: Line) -> None:
-            advance(1)
-            end = "solved" if line["success"] else "failed" if line["failed"] else "not solved"
-            click.echo(f"{line['row']} {line['seed']}: {end} after {line['steps']} actions")
+    def report(line: Line) -> None:
+        end = "solved" if line["success"] else "failed" if line["failed"] else "not solved"
+        click.echo(f"{line['row']} {line['seed']}: {end} after {line['steps']} actions")
+        write_plan_page(where)
 
-        table = plan_episodes(
-            run,
-            task,
-            settings,
-            seeds=seeds,
-            rows=chosen,
-            out=where,
-            videos=videos,
-            device=device,
-            report=report,
-            tell=lambda text: click.echo(text, err=True),
-        )
-    print_table(table)
+    plan_episodes(
+        run,
+        task,
+        settings,
+        seeds=seeds,
+        rows=chosen,
+        out=where,
+        videos=videos,
+        device=device,
+        report=report,
+        progress=True,
+    )
+    print_page_table(write_plan_page(where))
     click.echo(where)
 
 
@@ -112,45 +111,75 @@ def draw_landscapes(
     """Draw the cost landscape of each episode, and print where the true action is in it."""
     from acwm_core.executors import progress_bar
     from acwm_core.training.run import load_run
+    from acwm_core.training.threads import use_threads
     from acwm_planning.landscape import SIDE, draw, landscape
     from acwm_planning.left_out import LeftOut
-    from acwm_planning.run import EpisodePlayer, usual_actions
+    from acwm_planning.run import EpisodePlayer, action_std_of
 
-    player = EpisodePlayer(load_run(run), task, settings, device, usual_actions(run))
-    left, told = LeftOut(), list[str]()
+    player = EpisodePlayer(load_run(run), task, settings, device, action_std_of(run))
+    left, messages = LeftOut(), list[str]()
+    use_threads(None, None, choose=True)
     click.echo(f"per episode, {SIDE * SIDE + 1} plans in the simulator and in the model", err=True)
     try:
         with progress_bar(f"landscapes of {task}", len(seeds)) as advance:
             for seed in seeds:
                 with left.trying("the landscape", seed):
-                    found = landscape(player, seed)
-                    path = draw(found, player.card.action, out / f"landscape-{seed:04d}.png")
-                    ranks = found.ranks.items()
-                    shares = ", ".join(f"{rank:.1%} in the {each}" for each, rank in ranks)
-                    told.append(f"{path}: cheaper than the true action are {shares}")
+                    costs = landscape(player, seed)
+                    path = draw(costs, player.card.action, out / f"landscape-{seed:04d}.png")
+                    ranks = costs.ranks.items()
+                    shares = ", ".join(f"{rank:.1%} in the {judge}" for judge, rank in ranks)
+                    messages.append(f"{path}: cheaper than the true action are {shares}")
                 advance(1)
-        if left.error and not told:
+        if left.error and not messages:
             raise left.error
     finally:
         player.close()
-    click.echo("\n".join(told))
+    click.echo("\n".join(messages))
 
 
-def print_table(table: Sequence[RowSummary]) -> None:
-    """Print a line per row, in at most 80 columns, and what the columns are."""
-    from rich.console import Console
-    from rich.table import Table
+@click.command()
+@click.argument("run", type=RUN)
+@click.argument("task")
+@click.option(
+    "--policies",
+    multiple=True,
+    default=("scripted",),
+    metavar="POLICY",
+    help="Policy to rank; repeat for several. scripted (the default) is all built-in ones; or give "
+    "one of them, such as solution,skill=0.7,noise=0.3,bias=0.15, or module:name for your own.",
+)
+@click.option("--seeds", default="0..7", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
+@click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/ranking/TASK by default.")
+@click.option("--steps", type=click.IntRange(1), help="Sampling steps; the model's own by default.")
+@click.option("--device", default="auto", help="Where the model runs.")
+def rank(
+    run: Path,
+    task: str,
+    policies: tuple[str, ...],
+    seeds: tuple[int, ...],
+    out: Path | None,
+    steps: int | None,
+    device: str,
+) -> None:
+    """Rank policies at TASK by rolling them out in the model of RUN.
 
-    from acwm_planning.table import HEADS
+    The same policies act in the true simulator from the same starts, which tells how far the
+    model's ranking can be trusted: correlations, rank violations, optimism, and what is lost by
+    choosing actions as the model would. Policies of your own see what the model predicts (closed
+    loop); scripted ones look at the simulator, so the model is given the actions they take there
+    (open loop). Stopped at any point, the same command resumes.
+    """
+    from acwm_planning.policies.scripted import parse_policy
 
-    grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for head in HEADS:
-        narrow = head.replace(" / ", " /\n")
-        grid.add_column(narrow, justify="right" if head else "left", overflow="fold")
-    for row in table:
-        grid.add_row(*row.cells())
-    Console(highlight=False, markup=False).print(grid)
-    click.echo(
-        "95 %: exact interval of the success; p: of McNemar's test against the first row;\n"
-        "final distance: mean in the end, of that at the start"
+    for word in policies:  # reports misspelt names before the slow import of torch
+        if word != "scripted" and ":" not in word:
+            parse_policy(word)
+
+    from acwm_planning.policies.run import rank_policies
+
+    where = out or run / "ranking" / task
+    ranking = rank_policies(
+        run, task, policies, seeds=seeds, out=where, steps=steps, device=device, progress=True
     )
+    print_ranking(ranking)
+    click.echo(where)
