@@ -1,9 +1,5 @@
 """acwm: action-conditioned video world models, from a simulator to an evaluated model."""
 
-from acwm_core.renamed import find_renamed_modules
-
-find_renamed_modules()
-
 
 def __getattr__(name: str) -> str:
     """Look up ``__version__`` on first use, as that takes longer than starting `acwm`."""

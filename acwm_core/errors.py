@@ -13,8 +13,6 @@ from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
-from acwm_core.renamed import renamed_attribute
-
 
 class AcwmError(Exception):
     """Base of every error a user can cause and fix."""
@@ -170,7 +168,3 @@ def suggest(name: str, known: Iterable[str]) -> str:
         return "; there is none."
     listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
     return f"; known: {listed}."
-
-
-def __getattr__(name: str) -> Any:
-    return renamed_attribute(__name__, name)

@@ -93,18 +93,6 @@ OWN = {
 }
 """Core's own components by kind and name: target and summary."""
 
-REMOVED_HOOKS = {
-    "register_checks": "give the suite to the kind: `registry.add(…, check='module:suite')` in "
-    "`register_kinds`",
-    "register_completions": "give a parameter of your command a `shell_complete`",
-    "register_dataset_exporters": "see `register_dataset_importers`",
-    "register_dataset_importers": "make importer and exporter one `acwm_formats.format.Format` "
-    "with `detect`, `read` and `write`, and add it in `register_formats`",
-    "register_gymnasium_environments": "call `gymnasium.register`",
-    "register_tables": "return the tables from `Protocol.tables`, and register the protocol",
-}
-"""What replaces hooks of the release before."""
-
 
 @dataclass(frozen=True)
 class Component:
@@ -411,15 +399,11 @@ class Catalog:
             distribution: the package to pip install for its extras.
 
         Raises:
-            PluginError: a plugin of that name is already loaded; or this one implements no hook, or
-                one that was removed.
+            PluginError: a plugin of that name is already loaded; or this one implements no hook.
             Exception: whatever the plugin raised, after everything it added was removed again.
         """
         if self._manager.has_plugin(name):
             raise PluginError(f"a plugin named {name!r} is already loaded")
-        for hook, instead in REMOVED_HOOKS.items():
-            if hasattr(plugin, hook):
-                raise PluginError(f"the hook {hook} was removed: {instead}")
         before = {kind: registry.components() for kind, registry in self._registries.items()}
         for registry in self._registries.values():
             registry.registering(name, distribution)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import click
 
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import writable
-from acwm_core.renamed import with_new_names
 
 FOLDER = click.Path(path_type=Path)
 
@@ -124,17 +123,6 @@ def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tupl
     if not found or len({*found}) != len(found) or min(found) < 0:
         raise click.BadParameter(f"{text}: give numbers of episodes, each once: 0,1,2 or 0..49")
     return found
-
-
-def renamed_option(old: str, new: str, **settings: Any) -> Callable[[Any], Any]:
-    """A hidden option with the old name of `new`; it warns and works for one more release."""
-
-    def warn(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
-        if value:
-            with_new_names({old: value}, {old: new})
-        return value
-
-    return click.option(old, hidden=True, callback=warn, help=f"Now {new}.", **settings)
 
 
 def split_options(

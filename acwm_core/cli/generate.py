@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from acwm_core.cli.arguments import OUT_FOLDER, renamed_option, size, split_options
+from acwm_core.cli.arguments import OUT_FOLDER, size, split_options
 from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
     default="processes",
     help="processes (this machine) or another name from `acwm list executor`.",
 )
-@renamed_option("--ray-address", "executor.address")
-@renamed_option("--sbatch", "executor.sbatch")
 def generate(
     environment: str,
     overrides: tuple[str, ...],
@@ -57,8 +55,6 @@ def generate(
     episodes: str | None,
     workers: int | None,
     executor: str,
-    ray_address: str | None,
-    sbatch: str | None,
     **others_of_data: Any,
 ) -> None:
     """Simulate a dataset of ENVIRONMENT.
@@ -78,8 +74,6 @@ def generate(
 
     out = out or Path("data", environment)
     others, options = split_options(overrides)
-    old = {"address": ray_address, "sbatch": sbatch}
-    options |= {name: value for name, value in old.items() if value}
     chosen = create_executor(executor, out / ".executor", workers, options)
     simulator = make_environment(catalog().component("environment", environment), {})
     counts = parse_episodes(episodes, simulator.card, split)

@@ -24,7 +24,6 @@ from acwm_core.files import disk_error
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.plugins import catalog
 from acwm_core.recipe.trust import trust_recipes
-from acwm_core.renamed import RenamedWarning
 
 
 class AcwmGroup(click.Group):
@@ -82,7 +81,6 @@ class AcwmGroup(click.Group):
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""
         _warnings.clear()
-        warnings.simplefilter("always", RenamedWarning)
         warnings.showwarning = _show_warning
         _print_anything()
         words = list(sys.argv[1:] if args is None else args)
@@ -161,7 +159,7 @@ _warnings: set[str] = set()
 def _show_warning(
     message: Warning | str, category: type[Warning], *more: Any, **extra: Any
 ) -> None:
-    if not issubclass(category, (AcwmWarning, RenamedWarning)):
+    if not issubclass(category, AcwmWarning):
         _show_any_warning(message, category, *more, **extra)
     elif str(message) not in _warnings:
         _warnings.add(str(message))

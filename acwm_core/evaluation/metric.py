@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,6 @@ from acwm_core.env.episode import Episode, plain_unit
 from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.errors import PluginError, ShapeError, check_shape, noting
 from acwm_core.evaluation.clips import Clip, Predictor, as_clip
-from acwm_core.renamed import RenamedWarning
 
 if TYPE_CHECKING:
     from acwm_core.model import shapes
@@ -115,11 +113,6 @@ class Prediction:
             raise ShapeError(
                 f"metrics compare two clips [T, 3, H, W] of one shape, not {video} with {target}"
             )
-
-    @property
-    def prediction(self) -> shapes.Clip:
-        """The former name of `video`, for one release."""
-        return self.video
 
     @functools.cached_property
     def observed(self) -> Observation:
@@ -347,11 +340,3 @@ def mean_of_defined(scores: NDArray[np.float64]) -> float:
     """The mean of the scores that are not NaN; NaN if all are."""
     defined = scores[~np.isnan(scores)]
     return float(defined.mean()) if len(defined) else float("nan")
-
-
-def __getattr__(name: str) -> type[Prediction]:
-    """The former name of `Prediction`, for one release."""
-    if name != "Rollout":
-        raise AttributeError(f"{__name__} has no {name!r}")
-    warnings.warn("Rollout is now called Prediction", RenamedWarning, stacklevel=2)
-    return Prediction

@@ -19,7 +19,7 @@ from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score
 from acwm_core.files import parse_json, written_whole
-from acwm_core.recipe.compose import RENAMED
+from acwm_core.recipe.former import current_settings
 
 pa: Any = importlib.import_module("pyarrow")  # it has no type stubs
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -123,8 +123,7 @@ def refuse_other_result(
     """
     try:
         facts = parse_json(file.read_bytes())["provenance"]
-        settings: dict[str, Any] = facts["evaluation"]
-        there = {RENAMED["evaluation"].get(n, n): v for n, v in settings.items()}
+        there = current_settings(facts["evaluation"])
         checksums = dict[str, str](facts["dataset"]["checksums"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return

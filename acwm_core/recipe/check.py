@@ -12,9 +12,8 @@ from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
 from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.metrics import LIBRARY_CLASS, MetricConfig, class_of_library, metric_configs
-from acwm_core.recipe.objective import INHERITED, resolved, with_current_sections
+from acwm_core.recipe.objective import INHERITED, resolved
 from acwm_core.recipe.signature import REQUIRED, Signature, signature
-from acwm_core.renamed import without_removed
 
 SECTIONS = {
     "training": "acwm_core.training.config:TrainingConfig",
@@ -23,14 +22,6 @@ SECTIONS = {
 }
 """For each section that is neither a component nor `trainer`, the class that gets its values. They
 are checked without importing torch."""
-
-REMOVED = {
-    "data": {
-        "skip_damaged": "a damaged shard stops with its name; delete it and run the command that "
-        "made it again"
-    }
-}
-"""What takes the place of parameters that old recipes set, by section and name."""
 
 FITTED = {
     "model": ("latent_channels", "state_size", "temporal_stride"),
@@ -49,7 +40,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         The parameters of each section, converted to the types of their constructors. Components
         also have a `name`; an optional component that was not given is missing.
     """
-    recipe = resolved(with_current_sections(recipe))
+    recipe = resolved(recipe)
     values = check_names(recipe)
     listed, evaluation = _metrics(values["evaluation"]), values["evaluation"]
     for name, config in listed.items():
@@ -97,8 +88,7 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def check_section(section: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Check the values of one of `SECTIONS`; return them with all defaults."""
     config = resolve_name(SECTIONS[section])
-    values = without_removed(dict(given), REMOVED.get(section, {}), f"{section}.")
-    values = _check(section, signature(config), values)
+    values = _check(section, signature(config), given)
     config(**values)  # checks ranges and combinations, which types cannot express
     return values
 

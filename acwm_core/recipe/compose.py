@@ -8,15 +8,12 @@ from typing import Any, cast
 
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.plugins import catalog
-from acwm_core.recipe.objective import INHERITED, chosen, inherited, with_current_sections
+from acwm_core.recipe.former import current_sections
+from acwm_core.recipe.objective import INHERITED, chosen, inherited
 from acwm_core.recipe.text import parse
-from acwm_core.renamed import with_new_names
 
 OVERLAYS = "overlays"
 """Folder in which ``+NAME`` is looked up: beside the recipe, then among packaged recipes."""
-
-RENAMED = {"evaluation": {"floor_episodes": "noise_floor_episodes"}}
-"""Renamed parameters: for each section, a map from old to new names."""
 
 COMPONENTS = ("env", "codec", "model", "conditioner", "objective")
 """Sections that hold a component, i.e. a registered name and its parameters."""
@@ -68,8 +65,7 @@ def parse_override(override: str) -> dict[str, Any]:
     value: Any = parse(text, f"the value of {override!r}")
     for name in reversed(names[1:]):
         value = {name: value}
-    sections = with_current_sections({names[0]: value})
-    return {section: _normal(section, value) for section, value in sections.items()}
+    return {names[0]: _normal(names[0], value)}
 
 
 def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,8 +111,7 @@ def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()
     recipe = dict(base)
     for name in names:
         recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
-    own = with_new_names(own, {"instead": "replace", "words": "overrides"})
-    own = with_current_sections(own)
+    own = current_sections(own)
     recipe = _replaced(recipe, own.pop("replace", {}), path)
     changes = {section: _normal(section, value) for section, value in own.items()}
     codec: dict[str, Any] = changes.get("codec") or {}
@@ -148,8 +143,7 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
     ):
         raise RecipeError(f"`replace` in {path} must list replacements, as in model: {{old: new}}")
     for name, table in cast(Mapping[str, Mapping[Any, Any]], replacements).items():
-        name = "objective" if name == "flow.objective" else str(name)
-        section, _, parameter = name.replace("flow.", "objective.", 1).partition(".")
+        section, _, parameter = str(name).partition(".")
         values: Any = recipe.get(section)
         given = cast(dict[str, Any], values) if isinstance(values, dict) else {}
         old = {**given.get(INHERITED, {}), **given}.get(parameter or "name")
@@ -192,12 +186,10 @@ def find_recipe(name: str, folder: Path) -> Path:
 
 
 def _normal(section: str, value: Any) -> Any:
-    """Expand the short form ``model: dit_s``, and replace old names of parameters."""
+    """Expand the short form ``model: dit_s``."""
     if section in COMPONENTS and value is not None and not isinstance(value, Mapping):
         return {"name": value}
-    if section in RENAMED and isinstance(value, Mapping):
-        return with_new_names(cast(Mapping[str, Any], value), RENAMED[section], f"{section}.")
-    return value  # pyright: ignore[reportUnknownVariableType]
+    return value
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, cast
 
 from acwm_core.plugins import catalog
-from acwm_core.renamed import RenamedWarning
 
 USUAL = "full_sequence"
 """The objective of a recipe that names none."""
@@ -75,28 +73,3 @@ def resolved(recipe: Mapping[str, Any]) -> dict[str, Any]:
     else:  # another model was chosen later
         values = {name: value for name, value in values.items() if name not in given}
     return {**recipe, "objective": values}
-
-
-def with_current_sections(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Sections of a recipe in which the former `flow` is the section `objective`."""
-    current = {name: value for name, value in sections.items() if name != "flow"}
-    if isinstance(model := current.get("model"), Mapping):  # `previous` follows from the objective
-        kept = cast(Mapping[str, Any], model).items()
-        current["model"] = {name: value for name, value in kept if name != "previous"}
-    flow = sections.get("flow")
-    if "flow" not in sections:
-        return current
-    warnings.warn(
-        "the section flow of recipes is now called objective: flow.objective=NAME is "
-        "objective=NAME, and flow.shift=5 is objective.shift=5",
-        RenamedWarning,
-        stacklevel=2,
-    )
-    if not isinstance(flow, Mapping):
-        return {**current, "objective": flow} if flow else current
-    values = dict(cast(Mapping[str, Any], flow))
-    if "objective" in values:
-        values = {"name": values.pop("objective"), FOLLOWS: True, **values}
-        if values["name"] != "next_frame":  # others had these parameters too, without an effect
-            values = {key: v for key, v in values.items() if key not in ("past_noise", "own_past")}
-    return {**current, "objective": {**values, **(current.get("objective") or {})}}

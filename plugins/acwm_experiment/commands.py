@@ -6,11 +6,11 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.arguments import FOLDER, renamed_option, seed_numbers, split_options
+from acwm_core.cli.arguments import FOLDER, seed_numbers, split_options
 from acwm_core.errors import RecipeError
 from acwm_core.files import writable
 
@@ -43,8 +43,6 @@ _say = partial(click.echo, err=True)
 @click.option(
     "--executor", help="Submit missing steps as jobs of a batch system, named as in `acwm list`."
 )
-@renamed_option("--slurm", "--executor slurm", is_flag=True)
-@renamed_option("--sbatch", "executor.sbatch or executor.steps.KIND", multiple=True)
 def experiment(
     file: str,
     overrides: tuple[str, ...],
@@ -55,8 +53,6 @@ def experiment(
     only_plan: bool,
     jobs: int,
     executor: str | None,
-    slurm: bool,
-    sbatch: tuple[str, ...],
 ) -> None:
     """Simulate, train, evaluate, plan and report all that FILE lists.
 
@@ -84,8 +80,6 @@ def experiment(
         words = sorted((file, *overrides), key=lambda word: "=" in word or word.startswith("+"))
         file, overrides = words[0], tuple(words[1:])
     overrides_of_recipes, options = split_options(overrides)
-    executor = executor or ("slurm" if slurm else None)
-    options |= _old_options(sbatch) if sbatch else {}
     if options and not executor:
         raise RecipeError(f"executor.{next(iter(options))} needs --executor")
     read = read_grid if grid else read_experiment
@@ -119,12 +113,3 @@ def _run(plan: ExperimentPlan, command: Sequence[str], jobs: int) -> None:
         click.echo(f"report: {plan.report}")
     if failures:
         click.get_current_context().exit(1)
-
-
-def _old_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Executor options from ``--sbatch "--partition=gpu" --sbatch "train=--time=24:00:00"``."""
-    options: dict[str, str] = {"": ""}
-    for text in texts:
-        kind, _, given = ("", "", text) if text.startswith("-") else text.partition("=")
-        options[kind] = f"{options.get(kind, '')} {given}".strip()
-    return {"sbatch": options.pop(""), "steps": options}

@@ -9,9 +9,6 @@ import click
 
 from acwm_core.cli.arguments import DATASET, split_parameters
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.renamed import without_removed
-
-REMOVED = {"--skip-damaged": "a damaged shard stops with its name; make it again and encode then"}
 
 
 @click.command()
@@ -35,7 +32,6 @@ REMOVED = {"--skip-damaged": "a damaged shard stops with its name; make it again
 @click.option(
     "--device", default="auto", help="cpu, cuda, cuda:1, …; auto is a GPU if there is one."
 )
-@click.option("--skip-damaged", is_flag=True, hidden=True, help="Is gone.")
 def encode(
     data: Path,
     overrides: tuple[str, ...],
@@ -43,7 +39,6 @@ def encode(
     split: str,
     symmetries: bool,
     device: str,
-    skip_damaged: bool,
     **windows: Any,
 ) -> None:
     """Encode the clips of a dataset as latents.
@@ -55,7 +50,6 @@ def encode(
     If it is interrupted, run the same command again to continue. Several commands share the work,
     also on several machines with a shared folder.
     """
-    without_removed({"--skip-damaged": skip_damaged}, REMOVED)
     others, parameters = split_parameters("codec", name, overrides)
     if others:
         raise RecipeError(f"{others[0]!r} sets no parameter of the codec; write codec.NAME=VALUE")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import Summary
-from acwm_core.recipe.compose import RENAMED, read_recipe
+from acwm_core.recipe.compose import read_recipe
+from acwm_core.recipe.former import current_settings
 from acwm_severity.curves import read_severity
 
 
@@ -43,18 +43,21 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     for curve in read_severity(folder, facts["weights_sha256"]):
         evaluations.append((curve.provenance["evaluation"], ["--sweep", curve.text]))
     known = {field.name for field in fields(EvaluationConfig)}  # old recipes may have others
-    settings = _renamed(recipe.get("evaluation") or {}).items()
+    settings = (recipe.get("evaluation") or {}).items()
     given = EvaluationConfig(**{name: v for name, v in settings if name in known}).to_dict()
     lines = [
-        ["acwm", "evaluate", again, *setting_overrides(given, _renamed(wanted)), *source, *sweep]
+        [
+            "acwm",
+            "evaluate",
+            again,
+            *setting_overrides(given, current_settings(wanted)),
+            *source,
+            *sweep,
+        ]
         for wanted, sweep in evaluations
     ]
     evaluated = map(shlex.join, [*lines, ["acwm", "report", again]])
     return [*generated, f"{fit} {shlex.join(['--out', again])}", *evaluated]
-
-
-def _renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    return {RENAMED["evaluation"].get(name, name): value for name, value in settings.items()}
 
 
 def _is_fetched(path: str) -> bool:

@@ -100,14 +100,6 @@ def test_two_names_for_one_plugin(install: Install) -> None:
     assert unharmed(catalog)
 
 
-def test_one_that_uses_a_hook_of_the_release_before(install: Install) -> None:
-    install("plugin_old", "@hookimpl\ndef register_tables(registry): pass\n")
-    reason = reasons(loaded())["plugin_old"]
-    assert (
-        "the hook register_tables was removed: return the tables from `Protocol.tables`" in reason
-    )
-
-
 def test_kinds_of_ones_own(install: Install) -> None:
     """A plugin that comes first in the alphabet may add to a kind that a later one defines."""
     components = """

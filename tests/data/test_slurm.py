@@ -128,15 +128,6 @@ def test_the_command_line_needs_slurm(tmp_path, monkeypatch):
         assert message in result.output
 
 
-def test_old_options_still_count(tmp_path):
-    """They name what they became; of another executor they are refused."""
-    for old, new in (("--sbatch", "sbatch"), ("--ray-address", "address")):
-        result = CliRunner().invoke(main, ["generate", "square", "--out", tmp_path, old, "x"])
-        assert result.exit_code == 2
-        assert f"{old} is now called executor.{new}" in result.output
-        assert f"LocalExecutor has no parameter '{new}'" in result.output
-
-
 def test_what_slurm_or_the_shell_refuse_is_told(cluster, tmp_path):
     with pytest.raises(RecipeError, match="no closing quotation"):
         SlurmExecutor(tmp_path / "job", sbatch="--comment='oops")

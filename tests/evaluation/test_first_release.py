@@ -26,7 +26,7 @@ OPTIONS = [
         "counterfactual_episodes=2",
         "perturbed_episodes=2",
         "videos=0",
-        "floor_episodes=2",
+        "noise_floor_episodes=2",
     )
 ]
 
@@ -87,7 +87,6 @@ def test_its_run_gets_the_same_scores(folder, before):
     arguments = ["evaluate", str(run), *data, "--overwrite", *OPTIONS]
     outcome = CliRunner().invoke(main, arguments)
     assert outcome.exit_code == 0, outcome.output
-    assert "evaluation.floor_episodes is now called evaluation.noise_floor" in outcome.stderr
     after = json.loads((run / "evaluation/summary.json").read_text())
     assert after["left_out"] == before["left_out"]
     expected, found = (each["splits"]["ood_test"] for each in (before, after))

@@ -154,8 +154,6 @@ def test_the_command_line_ends_with_a_sentence_and_writes_nothing(tmp_path, monk
         (["ablations/scale", "model.layer=2"], "has no parameter 'layer'; did you mean 'layers'?"),
         (["ablations/scale", "--executor", "slurm"], "this machine has no sbatch"),
         (["ablations/scale", "--executor", "processes"], "'processes' takes no jobs that outlive"),
-        (["ablations/scale", "--slurm"], "--slurm is now called --executor slurm"),
-        (["ablations/scale", "--slurm", "--sbatch", "fit=--time=1"], 'executor.steps={"fit": '),
     ):
         monkeypatch.setenv("PATH", str(tmp_path))
         result = CliRunner().invoke(main, ["experiment", *words], standalone_mode=True)

@@ -91,7 +91,9 @@ def test_a_failed_job_takes_only_its_own_with_it(acwm, cluster, tmp_path):
     assert "failed   train narrow · seed 0 (" in out
     assert "to do    evaluate narrow · seed 0" in out
 
-    code, out, err = acwm("experiment", "widths.yaml", "--slurm", cwd=tmp_path, FIXED="1")
+    code, out, err = acwm(
+        "experiment", "widths.yaml", "--executor", "slurm", cwd=tmp_path, FIXED="1"
+    )
     assert (code, out[:6]) == (0, "3 jobs"), err
     wait_until(all_ended(cluster))
     assert json.loads((made / "runs" / failed / "evaluation" / "summary.json").read_text())

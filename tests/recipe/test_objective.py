@@ -1,13 +1,10 @@
 """The objective of a recipe: swapped by a word, following its model, read from older recipes."""
 
-import warnings
-
 import pytest
 import yaml
 
 from acwm_core.errors import RecipeError
 from acwm_core.recipe import Recipe, compose
-from acwm_core.renamed import RenamedWarning
 
 SMALL = {"shift": 20.0, "prediction": "clean", "loss_on": "clean", "weighting": "none", "steps": 4}
 PAST = {"past_noise": 0.3, "own_past": 0.0}
@@ -88,23 +85,9 @@ def test_a_recipe_that_names_none_is_one_level_per_clip():
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (["flow.shift=5"], ["objective.shift=5"]),
-        (["flow.objective=next_frame"], ["objective=next_frame"]),
-        (["+next_frame", "flow.own_past=0.5"], ["+next_frame", "objective.own_past=0.5"]),
-        (["model=recurrent", "flow.objective=next_frame"], ["model=recurrent"]),
-    ],
-)
-def test_the_former_section_is_read_from_a_command_line(old, new):
-    with pytest.warns(RenamedWarning, match=r"flow\.objective=NAME is objective=NAME"):
-        assert compose("push_cube_small", old) == compose("push_cube_small", new)
-
-
-@pytest.mark.parametrize(
     "words", [[], ["+next_frame"], ["+recurrent"], ["+next_frame", "+recurrent"]]
 )
-def test_the_former_section_is_read_from_a_run_folder(tmp_path, words):
+def test_a_recipe_of_an_older_run_is_read(tmp_path, words):
     """As acwm wrote it before objectives were components: every model had all parameters."""
     recipe = compose("push_cube_small", words)
     old = recipe.to_dict()
@@ -114,25 +97,8 @@ def test_the_former_section_is_read_from_a_run_folder(tmp_path, words):
     if "inputs" in old["model"]:
         del old["model"]["inputs"]
         old["model"]["previous"] = None
+    old["data"]["skip_damaged"] = False
+    old["evaluation"]["floor_episodes"] = old["evaluation"].pop("noise_floor_episodes")
     saved = tmp_path / "recipe.yaml"
     saved.write_text(yaml.safe_dump(old))
-    with pytest.warns(RenamedWarning):
-        assert compose(saved) == recipe
-
-
-def test_an_overlay_of_before_replaces_what_it_lists(tmp_path):
-    (tmp_path / "overlays").mkdir()
-    (tmp_path / "overlays/old.yaml").write_text(
-        "replace:\n  flow.objective: {diffusion_forcing: next_frame}\n"
-        "  flow.prediction: {clean: velocity}\n"
-    )
-    (tmp_path / "mine.yaml").write_text("extends: push_cube_small\n")
-    name, params = objective("+old", recipe=tmp_path / "mine.yaml")
-    assert (name, params["prediction"]) == ("next_frame", "velocity")
-
-
-def test_current_recipes_say_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RenamedWarning)
-        for words in ([], ["+next_frame"], ["+recurrent"]):
-            compose("push_cube_small", words)
+    assert compose(saved) == recipe

@@ -12,7 +12,6 @@ from acwm_core.data.generate import generate
 from acwm_core.data.latents import encode_windows
 from acwm_core.data.shards import open_shard
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.renamed import RenamedWarning
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
 from acwm_core.training.run_folder import RunFolder
@@ -67,12 +66,6 @@ def test_a_damaged_shard_ends_training_with_its_name(shards, tmp_path, data):
     damage(shards)
     with pytest.raises(DataError, match=r"shard .*shard-00001\.tar is damaged"):
         fit(tiny_recipe(shards, data=data), tmp_path / "ends")
-
-
-def test_skip_damaged_is_told_to_be_gone(shards):
-    with pytest.warns(RenamedWarning, match=r"data\.skip_damaged is gone: a damaged shard stops"):
-        recipe = tiny_recipe(shards, data={"skip_damaged": True})
-    assert recipe == tiny_recipe(shards, data={"skip_damaged": False})
 
 
 def test_steps_of_another_size_are_refused(shards):

@@ -1,0 +1,44 @@
+"""Reads recipes and evaluation settings that earlier versions of acwm wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+from acwm_core.recipe.objective import FOLLOWS
+
+_SETTINGS = {"floor_episodes": "noise_floor_episodes"}
+
+
+def current_settings(evaluation: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of an evaluation under their present names."""
+    return {_SETTINGS.get(name, name): value for name, value in evaluation.items()}
+
+
+def current_sections(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of a recipe file as they are written today.
+
+    Until 0.1, the objective was a parameter of the section `flow`, a model had `previous`, which
+    follows from the objective, and `data.skip_damaged` passed over shards.
+    """
+    current = {name: value for name, value in sections.items() if name != "flow"}
+    for section, name in (("model", "previous"), ("data", "skip_damaged")):
+        if isinstance(values := current.get(section), Mapping):
+            kept = cast(Mapping[str, Any], values).items()
+            current[section] = {key: value for key, value in kept if key != name}
+    if isinstance(evaluation := current.get("evaluation"), Mapping):
+        current["evaluation"] = current_settings(cast(Mapping[str, Any], evaluation))
+    if flow := sections.get("flow"):
+        current["objective"] = _objective(flow, current.get("objective"))
+    return current
+
+
+def _objective(flow: Any, given: Any) -> Any:
+    if not isinstance(flow, Mapping):
+        return flow  # the check of the section says what is wrong
+    values = dict(cast(Mapping[str, Any], flow))
+    if "objective" in values:
+        values = {"name": values.pop("objective"), FOLLOWS: True, **values}
+        if values["name"] != "next_frame":  # others had these parameters too, without an effect
+            values = {key: v for key, v in values.items() if key not in ("past_noise", "own_past")}
+    return {**values, **(given or {})}
