@@ -12,7 +12,13 @@ from click.shell_completion import CompletionItem
 from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
 from acwm_core.recipe.check import SECTIONS, check_names
-from acwm_core.recipe.compose import COMPONENTS, OVERLAYS, read_recipe, recipe_folder
+from acwm_core.recipe.compose import (
+    COMPONENTS,
+    OVERLAYS,
+    read_recipe,
+    recipe_folder,
+    recipe_names,
+)
 from acwm_core.recipe.objective import INHERITED, resolved
 from acwm_core.recipe.recipe import flat_items
 from acwm_core.recipe.signature import signature
@@ -35,8 +41,7 @@ def environments(ctx: click.Context, incomplete: str) -> Items:
 
 def recipes(ctx: click.Context, incomplete: str) -> Items:
     """Recipes that come with acwm, and files, which the shell adds."""
-    paths = sorted(recipe_folder().glob("*.yaml"))
-    return [*_starting(incomplete, ((path.stem, "") for path in paths)), _files(incomplete)]
+    return [*_starting(incomplete, ((name, "") for name in recipe_names())), _files(incomplete)]
 
 
 def experiments(ctx: click.Context, incomplete: str) -> Items:

@@ -15,6 +15,9 @@ from acwm_core.recipe.text import parse
 OVERLAYS = "overlays"
 """Folder in which ``+NAME`` is looked up: beside the recipe, then among packaged recipes."""
 
+VARIANTS = "paper"
+"""Folder of the packaged recipes that vary another one."""
+
 COMPONENTS = ("env", "codec", "model", "conditioner", "objective")
 """Sections that hold a component, i.e. a registered name and its parameters."""
 
@@ -88,14 +91,21 @@ def recipe_folder() -> Path:
     return packaged if packaged.is_dir() else package.parent / "recipes"
 
 
+def recipe_files() -> dict[str, Path]:
+    """The packaged recipes that are complete by themselves, by name."""
+    folder = recipe_folder()
+    paths = [*folder.glob("*.yaml"), *(folder / VARIANTS).glob("*.yaml")]
+    return {path.stem: path for path in sorted(paths, key=lambda p: p.stem) if path.stem != "base"}
+
+
 def recipe_names() -> list[str]:
-    """Names of the packaged recipes that are complete by themselves."""
-    return sorted(path.stem for path in recipe_folder().glob("*.yaml") if path.stem != "base")
+    """The names of `recipe_files`."""
+    return [*recipe_files()]
 
 
 def recipe_summaries() -> dict[str, str]:
-    """The first comment line of each recipe of `recipe_names`, by name."""
-    texts = {name: (recipe_folder() / f"{name}.yaml").read_text("utf-8") for name in recipe_names()}
+    """The first comment line of each of `recipe_files`, by name."""
+    texts = {name: path.read_text("utf-8") for name, path in recipe_files().items()}
     return {name: text.splitlines()[0].lstrip("# ") for name, text in texts.items()}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from acwm_core.data.card import CARD
 from acwm_core.errors import RecipeError
 from acwm_core.recipe import Recipe, compose
-from acwm_core.recipe.compose import find_recipe, recipe_folder
+from acwm_core.recipe.compose import find_recipe, recipe_files
 from acwm_experiment.files import DataChoice, ExperimentFile, slug
 from acwm_experiment.logs import StepLogs
 from acwm_experiment.names import run_names
@@ -92,10 +92,8 @@ def _composed(file: ExperimentFile, cell: ExperimentCell) -> tuple[str, Recipe]:
         raise RecipeError(f"{cell.title}: {error}") from error
     if recipe.trainer.get("max_steps", -1) < 1:
         raise RecipeError(f"{cell.title}: set trainer.max_steps, the length of its training")
-    shipped = recipe_folder().resolve()
-    if path.is_relative_to(shipped):
-        return str(path.relative_to(shipped).with_suffix("")), recipe
-    return str(path), recipe
+    names = {path.resolve(): name for name, path in recipe_files().items()}
+    return names.get(path, str(path)), recipe
 
 
 def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> DatasetSpec | None:
