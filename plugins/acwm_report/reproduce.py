@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.remote import origin
@@ -43,8 +44,8 @@ def commands(folder: Path, summary: Summary) -> list[str]:
     for curve in read_severity(folder, facts["weights_sha256"]):
         evaluations.append((curve.provenance["evaluation"], ["--sweep", curve.text]))
     known = {field.name for field in fields(EvaluationConfig)}  # old recipes may have others
-    settings = (recipe.get("evaluation") or {}).items()
-    given = EvaluationConfig(**{name: v for name, v in settings if name in known}).to_dict()
+    settings: dict[str, Any] = recipe.get("evaluation") or {}
+    given = EvaluationConfig(**{name: v for name, v in settings.items() if name in known}).to_dict()
     lines = [
         [
             "acwm",
