@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 SELECT ?= not slow and not gpu and not browser and not ci
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format types lowest docs site codec-weights decoders build clean
+.PHONY: help install demo test test-all lint format types lowest docs site build clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -48,42 +48,6 @@ docs: $(VENV)/installed-all  ## Draw the pictures of docs/reference/environments
 
 site: $(VENV)/installed-all  ## Build the site of the documents in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
-
-# Training episodes at 64×64 and at the environment's own size, of the weights of `fine` that ship.
-CODEC_DATA := cloth_move:128:12 push_sand:80:12 pour_water:40:12 stack_cube:160:24 \
-	reacher:200:24 push_cube:200:24 push_rope:160:24 robot_arm:200:24
-CODEC_FOLDER ?= data/codec
-CODEC_OPTIONS ?= --steps 16000 --batch 16 --peak 8e-4
-# Episodes that no model that ships has seen: it predicts its own better.
-DECODER_DATA := cloth_move:256 push_sand:88 pour_water:96 stack_cube:256 push_rope:256 push_cube:256 \
-  robot_arm:256 reacher:256
-# The models that ship and predict its latents; of other worlds it learns from true ones.
-DECODER_MODELS := push_sand push_cube
-DECODER := $(CODEC_FOLDER)/compact_reference.safetensors
-DECODER_OPTIONS ?= --batch 24 --peak 5e-4
-
-codec-weights: $(VENV)/installed-all  ## Train the codec fine anew, in hours (docs/codecs.md)
-	@set -e; for each in $(CODEC_DATA); do \
-	  set -- $$(echo $$each | tr : ' '); \
-	  size=64; if [ $$1 = push_sand ]; then size=64x104; fi; \
-	  $(BIN)/acwm generate $$1 --split train --size $$size --episodes $$2 --out $(CODEC_FOLDER)/$$1_64; \
-	  $(BIN)/acwm generate $$1 --split train --episodes $$3 --out $(CODEC_FOLDER)/$$1_240; \
-	done
-	$(BIN)/acwm train-codec $(CODEC_FOLDER)/*_64 $(CODEC_FOLDER)/*_64 $(CODEC_FOLDER)/*_64 \
-	  $(CODEC_FOLDER)/*_240 --codec fine --start random --out $(CODEC_FOLDER)/fine.safetensors \
-	  $(CODEC_OPTIONS)
-
-decoders: codec-weights  ## Train compact_reference anew
-	@set -e; for each in $(DECODER_DATA); do \
-	  set -- $$(echo $$each | tr : ' '); \
-	  size=64; if [ $$1 = push_sand ]; then size=64x112; fi; \
-	  $(BIN)/acwm generate $$1 --split train --size $$size --episodes $$2 --seed 7 \
-	    $$(if [ $$1 != pour_water ]; then echo --exploration 0.4; fi) --out $(CODEC_FOLDER)/new/$$1; \
-	done
-	$(BIN)/acwm train-codec $(CODEC_FOLDER)/new/* $(CODEC_FOLDER)/new/* $(CODEC_FOLDER)/*_240 \
-	  --codec compact_reference --start compact --out $(DECODER) $(DECODER_OPTIONS) --steps 8000 \
-	  $(addprefix --predicted-by ,$(DECODER_MODELS))
-	cp $(DECODER) plugins/acwm_codecs/weights/compact_reference.safetensors
 
 build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
 	$(BIN)/python -m build

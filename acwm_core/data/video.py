@@ -1,8 +1,8 @@
 """Encode and decode video: bit-exact for shards, and small MP4 files for people to watch.
 
 Frames are stored as lossless H.264 in RGB (no colour conversion), masks as grey FFV1, both in
-Matroska; benchmarks/formats.py compares codecs. Key frames let a clip be decoded without the whole
-video before it. With one thread and FFmpeg's bit-exact mode, equal frames give equal bytes.
+Matroska. Key frames let a clip be decoded without the whole video before it. With one thread and
+FFmpeg's bit-exact mode, equal frames give equal bytes.
 """
 
 from __future__ import annotations
