@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from acwm_core.env.environment import Environment
     from acwm_core.env.task import Task, TaskEnvironment
     from acwm_core.errors import AcwmError
-    from acwm_core.evaluation.evaluate import evaluate_run as evaluate
     from acwm_core.model.build import build_world_model
     from acwm_core.model.world_model import WorldModel
     from acwm_core.recipe import Recipe, compose
     from acwm_core.training.fit import fit
     from acwm_core.training.run import load_run as load
+    from acwm_interventions.evaluate import evaluate_run as evaluate
     from acwm_planning.planner import Planner
 
 __all__ = [
@@ -69,7 +69,7 @@ _HOMES = {
     "WorldModel": "acwm_core.model.world_model:WorldModel",
     "build_world_model": "acwm_core.model.build:build_world_model",
     "compose": "acwm_core.recipe:compose",
-    "evaluate": "acwm_core.evaluation.evaluate:evaluate_run",
+    "evaluate": "acwm_interventions.evaluate:evaluate_run",
     "fit": "acwm_core.training.fit:fit",
     "generate": "acwm_core.data.generate:generate",
     "load": "acwm_core.training.run:load_run",

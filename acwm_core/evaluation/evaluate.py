@@ -25,7 +25,6 @@ from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.evaluation.clips import PREDICTORS, Predictor, sound_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.draws import metrics_for
-from acwm_core.evaluation.interventions import Interventions, intervene, units_of_work
 from acwm_core.evaluation.predict import Evaluator, VideoModel
 from acwm_core.evaluation.protocol import Published, published_for
 from acwm_core.evaluation.provenance import provenance, run_facts
@@ -39,6 +38,7 @@ from acwm_core.evaluation.storage import (
     replacing_result,
     write_scores,
 )
+from acwm_core.evaluation.study import Findings, Study
 from acwm_core.evaluation.summarise import gap, summarise_split
 from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip
 from acwm_core.evaluation.views import metrics_of_views
@@ -73,14 +73,13 @@ def evaluate_run(
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: bool = True,
+    studies: Sequence[Study] = (),
 ) -> Summary:
     """Predict and score every test clip of a run's dataset, and write the results.
 
     The model is compared with three reference rows on the same clips: a copy of the first frame,
-    the model with another episode's actions, and the codec's reconstruction. If the simulator is
-    installed, it also shows for a few clips what other actions would do, and gives the
-    predictability horizon. The same run, data and settings give the same numbers, whatever the
-    batch size (up to float32 rounding).
+    the model with another episode's actions, and the codec's reconstruction. The same run, data and
+    settings give the same numbers, whatever the batch size (up to float32 rounding).
 
     Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``. A result of
     other weights with the same settings is replaced.
@@ -93,6 +92,7 @@ def evaluate_run(
         out: a folder to write to instead of `run`; it can be reported and compared like a run.
         overwrite: replace a result that was made with other settings, or on other data.
         progress: show a progress bar on the terminal.
+        studies: what is measured besides, e.g. with the simulator.
 
     Returns:
         The content of ``summary.json``.
@@ -115,9 +115,8 @@ def evaluate_run(
         )
     entrant = Entrant(parts, facts, published)
     home = results_folder(folder, out)
-    return evaluate_clips(
-        evaluator, datasets, home, entrant, overwrite=overwrite, progress=progress
-    )
+    how = {"overwrite": overwrite, "progress": progress}
+    return evaluate_clips(evaluator, datasets, home, entrant, studies=studies, **how)
 
 
 def evaluate_clips(
@@ -128,6 +127,7 @@ def evaluate_clips(
     *,
     overwrite: bool,
     progress: bool,
+    studies: Sequence[Study] = (),
 ) -> Summary:
     """Predict and score the test clips of these splits, and write the results to `home`.
 
@@ -137,7 +137,7 @@ def evaluate_clips(
         if not overwrite:
             checksums = {split: each.checksum for split, each in datasets.items()}
             refuse_other_result(home / SUMMARY, evaluator.config, checksums, OF_SWEEPS)
-        return _evaluate(evaluator, datasets, home, entrant, progress)
+        return _evaluate(evaluator, datasets, home, entrant, progress, studies)
 
 
 def results_folder(run: RunFolder, out: str | Path | None) -> Path:
@@ -158,19 +158,22 @@ def _evaluate(
     home: Path,
     entrant: Entrant,
     progress: bool,
+    studies: Sequence[Study],
 ) -> Summary:
     started, config = time.monotonic(), evaluator.config
     planned = {s: sound_clips(each, config, evaluator.given) for s, each in datasets.items()}
     clips = {split: each for split, (each, _) in planned.items()}
     total = sum(evaluator.count_rows(each) for each in clips.values())
-    with progress_bar(evaluator, total + units_of_work(evaluator, clips), progress) as shown:
+    total += sum(study.count_rows(evaluator, clips) for study in studies)
+    with progress_bar(evaluator, total, progress) as shown:
         scores = {s: scores_with_references(shown, clips[s], datasets[s]) for s in datasets}
         sweeps = {s: shown.sweep(clips[s], datasets[s]) for s in datasets}
-        found = intervene(shown, clips, datasets)
+        findings = [study.run(shown, clips, datasets) for study in studies]
     videos = [v for s in datasets for v in evaluator.videos(clips[s], datasets[s], scores[s])]
-    videos += found.videos
-    scores = {split: [*each, *found.scores.get(split, ())] for split, each in scores.items()}
-    summary = _summarise(home, entrant, evaluator, scores, sweeps, found)
+    for each in findings:
+        videos += each.videos
+        scores = {split: [*rows, *each.scores.get(split, ())] for split, rows in scores.items()}
+    summary = _summarise(home, entrant, evaluator, scores, sweeps, findings)
     summary.videos.extend(record for record, _ in videos)
     for _, damaged in planned.values():
         summary.left_out.update(damaged)
@@ -291,24 +294,21 @@ def _summarise(
     evaluator: Evaluator,
     scores: Mapping[str, list[Score]],
     sweeps: Mapping[str, Mapping[int, list[Score]]],
-    found: Interventions,
+    findings: Sequence[Findings],
 ) -> Summary:
     """The summary of all splits, without videos and provenance."""
     metrics, config, card = evaluator.metrics, evaluator.config, evaluator.card
     inside, outside = scores.get("ind_test"), scores.get("ood_test")
-    return Summary(
+    splits = {
+        split: summarise_split(each, metrics, config.seed, sweeps[split])
+        for split, each in scores.items()
+    }
+    summary = Summary(
         run=home.resolve().parent.name,
         parts=entrant.parts,
         metrics={name: metric.info for name, metric in metrics.items()},
         headline=evaluator.headline,
-        splits={
-            split: replace(
-                summarise_split(each, metrics, config.seed, sweeps[split]),
-                counterfactual=found.counterfactual.get(split),
-                predictability=found.predictability.get(split),
-            )
-            for split, each in scores.items()
-        },
+        splits=splits,
         gap=gap(inside, outside, metrics, config.seed) if inside and outside else {},
         environment={
             **{name: getattr(card, name) for name in ("name", "summary", "fps", "citation")},
@@ -316,10 +316,14 @@ def _summarise(
             **({"views": card.view_names} if card.views else {}),
         },
         protocol=config.protocol,
-        left_out={**evaluator.left_out, **found.left_out},
-        ensembles=found.ensembles,
+        left_out={**evaluator.left_out},
         published=entrant.published,
     )
+    for each in findings:
+        splits = {s: replace(own, **each.splits.get(s, {})) for s, own in summary.splits.items()}
+        summary = replace(summary, splits=splits, **each.summary)
+        summary.left_out.update(each.left_out)
+    return summary
 
 
 def _write(

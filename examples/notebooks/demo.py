@@ -71,7 +71,7 @@ picture
 
 # %%
 from acwm_core.data.generate import generate
-from acwm_core.evaluation.evaluate import evaluate_run
+from acwm_interventions.evaluate import evaluate_run
 
 generate("push_cube", "few", episodes={"ind_test": 2, "ood_test": 2}, size=64, workers=0)
 settings = {

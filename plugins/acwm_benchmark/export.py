@@ -22,14 +22,14 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import Clip, plan_clips, read_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import branches_of
 from acwm_core.evaluation.evaluate import open_splits
-from acwm_core.evaluation.interventions import COUNTERFACTUAL, asked_clips, simulator_of
 from acwm_core.files import made_whole, writing
 from acwm_core.model.world_model import CLIP_FRAMES
 from acwm_core.plugins import catalog
 from acwm_core.recipe.check import check_section
 from acwm_core.recipe.compose import read_recipe, recipe_folder
+from acwm_interventions.counterfactual import branches_of
+from acwm_interventions.interventions import COUNTERFACTUAL, asked_clips, simulator_of
 
 PUBLIC = 0
 """The seed of the public benchmark; any other is kept secret."""

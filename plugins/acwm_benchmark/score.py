@@ -20,6 +20,7 @@ from acwm_core.evaluation.results import FOLDER, Summary
 from acwm_core.files import writing
 from acwm_core.recipe.check import check_section
 from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
+from acwm_interventions.evaluate import STUDIES
 from acwm_report.entry import Entry, read_entry
 
 
@@ -105,9 +106,8 @@ def _score(
     parts = {"env": world.name, "model": entry.name}
     secret = world.seed is None and not world.source
     entrant = Entrant(parts, facts, published_for({"env": world.name}), secret)
-    return evaluate_clips(
-        evaluator, datasets, home, entrant, overwrite=overwrite, progress=progress
-    )
+    how = {"overwrite": overwrite, "progress": progress}
+    return evaluate_clips(evaluator, datasets, home, entrant, studies=STUDIES, **how)
 
 
 def settings_of(world: World, tasks: Tasks) -> EvaluationConfig:

@@ -77,7 +77,7 @@ def evaluate(
             print_severity(curve)
         return
 
-    from acwm_core.evaluation.evaluate import evaluate_run
+    from acwm_interventions.evaluate import evaluate_run
 
     print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
     click.echo(f"next: acwm report {where['out'] or run}")

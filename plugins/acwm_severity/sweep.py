@@ -14,13 +14,13 @@ from acwm_core.env.episode import EpisodeSpec, Factor, Split
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Predictor, plan_clips
 from acwm_core.evaluation.evaluate import open_run, progress_bar, results_folder
-from acwm_core.evaluation.interventions import simulator_of
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.storage import refuse_other_result
 from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run_folder import RunFolder, run_to_write
+from acwm_interventions.interventions import simulator_of
 from acwm_severity.curves import (
     SEVERITY,
     SeverityCurve,

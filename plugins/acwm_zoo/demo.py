@@ -142,8 +142,8 @@ def _fit(recipe: Recipe, run: Path) -> bool:
 
 
 def _evaluate(run: Path) -> bool:
-    from acwm_core.evaluation.evaluate import evaluate_run
     from acwm_core.training.run_folder import RunFolder
+    from acwm_interventions.evaluate import evaluate_run
 
     if _is_newer(run, RunFolder(run).weights):
         return False
@@ -153,8 +153,8 @@ def _evaluate(run: Path) -> bool:
 
 def _shipped(recipe: Recipe, out: Path) -> bool:
     """Evaluate the shipped model of this world on the same clips."""
-    from acwm_core.evaluation.evaluate import evaluate_run
     from acwm_core.evaluation.results import FOLDER, SUMMARY
+    from acwm_interventions.evaluate import evaluate_run
 
     if (out / FOLDER / SUMMARY).exists():
         return False

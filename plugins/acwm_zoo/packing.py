@@ -13,7 +13,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 
 from acwm_core.errors import TrainingError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import EPISODES
 from acwm_core.files import made_whole, writing
@@ -22,6 +21,7 @@ from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import with_overrides
 from acwm_core.training.run import load_run, read_metadata, save_weights, training_of
 from acwm_core.training.run_folder import RunFolder
+from acwm_interventions.evaluate import evaluate_run
 from acwm_zoo.model_card import model_card
 from acwm_zoo.shipped import MODEL_CARD
 

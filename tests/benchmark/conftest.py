@@ -50,7 +50,7 @@ def noisy_run(truth, tmp_path_factory):
 
 
 def evaluated(run, truth, **more):
-    from acwm_core.evaluation.evaluate import evaluate_run
+    from acwm_interventions.evaluate import evaluate_run
 
     settings = {**FEW, "steps_sweep": "[]", "device": "cpu", **more}
     words = [f"evaluation.{name}={value}" for name, value in settings.items()]

@@ -18,7 +18,7 @@ def data(parts, tmp_path_factory):
 @pytest.fixture(scope="session")
 def evaluated(data, tmp_path_factory):
     """An evaluated run; tests must not change it."""
-    from acwm_core.evaluation.evaluate import evaluate_run
+    from acwm_interventions.evaluate import evaluate_run
 
     run = tiny.make_run(tmp_path_factory.mktemp("runs") / "first", data, **tiny.SWEEP)
     evaluate_run(run, progress=False)

@@ -13,18 +13,18 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Clip, as_clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import (
+from acwm_core.evaluation.metric import Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.score import build_metrics
+from acwm_interventions.counterfactual import (
     SIZES,
     counterfactual,
     max_branches,
     plan_branches,
     simulate_branches,
 )
-from acwm_core.evaluation.interventions import asked_clips
-from acwm_core.evaluation.metric import Prediction
-from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.score import build_metrics
+from acwm_interventions.interventions import asked_clips
 from acwm_metrics.response import Response
 
 FRAMES, CLIPS = 10, 2

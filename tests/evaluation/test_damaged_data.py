@@ -5,9 +5,9 @@ import shutil
 import pytest
 
 from acwm_core.errors import AcwmWarning, DataError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.storage import read_scores
+from acwm_interventions.evaluate import evaluate_run
 from tests import tiny
 from tests.evaluation.test_given_frames import QUICK
 from tests.folders import damage_episode

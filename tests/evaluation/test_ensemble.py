@@ -14,16 +14,16 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.ensemble import (
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.score import build_metrics
+from acwm_interventions.ensemble import (
     RESOLVED,
     compare_ensembles,
     energy_distances,
     start_doubt,
 )
-from acwm_core.evaluation.interventions import intervene
-from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.results import Summary
-from acwm_core.evaluation.score import build_metrics
+from acwm_interventions.interventions import intervene
 from acwm_report.run import EvaluatedRun
 from acwm_report.tables import ensemble_tables
 from acwm_report.terminal import print_summary

@@ -12,13 +12,13 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import AcwmError, AcwmWarning, DataError, RecipeError, TrainingError
 from acwm_core.evaluation.clips import plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluate import choose_device, evaluate_run
-from acwm_core.evaluation.interventions import Interventions
+from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
+from acwm_interventions.evaluate import evaluate_run
 from tests import tiny
 from tests.evaluation.by_hand import predictions, squared_error
 
@@ -147,7 +147,7 @@ def test_a_perfect_model_stays_finite_or_null_in_json(data, tmp_path):
         evaluator,
         results,
         {"ind_test": {}},
-        Interventions(),
+        [],
     )
     summary.provenance["dataset"] = {"frame_size": [32, 32]}
     _write(run / "evaluation", summary, results, videos)

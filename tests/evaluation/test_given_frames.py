@@ -11,13 +11,13 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import Clip, as_clip, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import counterfactual, simulate_branches
-from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.interventions import perturbed
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.score import build_metrics
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.training.run import load_run
+from acwm_interventions.counterfactual import counterfactual, simulate_branches
+from acwm_interventions.evaluate import evaluate_run
+from acwm_interventions.interventions import perturbed
 from acwm_metrics.response import Response
 from tests import tiny
 from tests.evaluation.by_hand import predictions, squared_error
@@ -156,7 +156,7 @@ def test_the_published_protocol_predicts_windows_from_one_frame():
 
 
 def test_more_frames_may_be_given_than_a_response_usually_has(run, monkeypatch):
-    monkeypatch.setattr("acwm_core.evaluation.interventions.CLIP_FRAMES", 4)
+    monkeypatch.setattr("acwm_interventions.interventions.CLIP_FRAMES", 4)
     asked = ["evaluation.counterfactual_metrics=[response]", "evaluation.counterfactual_episodes=2"]
     summary = evaluate_run(run, overrides=asked, overwrite=True, progress=False)
     found = summary.splits["ind_test"].counterfactual

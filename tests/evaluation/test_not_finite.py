@@ -12,13 +12,13 @@ from safetensors.torch import load_file, save_file
 
 from acwm_core.cli.main import main
 from acwm_core.errors import DataError, TrainingError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder
+from acwm_interventions.evaluate import evaluate_run
 from acwm_report.boards import boards_of
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report

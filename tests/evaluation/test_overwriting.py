@@ -10,7 +10,6 @@ from acwm_core.cli.main import main
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Summary
 from acwm_core.evaluation.storage import (
     EPISODES,
@@ -21,6 +20,7 @@ from acwm_core.evaluation.storage import (
 )
 from acwm_core.files import held
 from acwm_core.recipe import compose
+from acwm_interventions.evaluate import evaluate_run
 from acwm_report.comparison import compare_runs
 from acwm_report.page import write_report
 from acwm_severity.sweep import sweep_severity

@@ -10,9 +10,10 @@ import pytest
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation import references
 from acwm_core.evaluation.clips import plan_clips
-from acwm_core.evaluation.evaluate import evaluate_run, open_run
+from acwm_core.evaluation.evaluate import open_run
 from acwm_core.evaluation.references import KEPT, package_hash, references_file
 from acwm_core.training.run_folder import RunFolder
+from acwm_interventions.evaluate import evaluate_run
 from tests import tiny
 
 

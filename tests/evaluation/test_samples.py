@@ -8,11 +8,11 @@ import torch
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation.clips import draw_seeds, noise_seed
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import load_run
+from acwm_interventions.evaluate import evaluate_run
 from acwm_report.draws import draws_phrase
 from acwm_report.terminal import print_summary
 from tests import tiny

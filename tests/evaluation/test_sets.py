@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import RecipeError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.metric import SetMetric
 from acwm_core.evaluation.results import Estimate, Summary
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.plugins import catalog, hookimpl
+from acwm_interventions.evaluate import evaluate_run
 from acwm_severity.curves import read_severity
 from acwm_severity.sweep import sweep_severity
 from tests import tiny

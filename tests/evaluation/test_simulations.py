@@ -10,10 +10,10 @@ from acwm_core.checks.disc import Disc
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
-from acwm_core.evaluation import simulations
-from acwm_core.evaluation.evaluate import evaluate_run
-from acwm_core.evaluation.interventions import simulator_of
-from acwm_core.evaluation.simulations import Again, simulate_again
+from acwm_interventions import simulations
+from acwm_interventions.evaluate import evaluate_run
+from acwm_interventions.interventions import simulator_of
+from acwm_interventions.simulations import Again, simulate_again
 from tests import tiny
 
 

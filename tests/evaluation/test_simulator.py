@@ -10,15 +10,15 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import Clip
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.interventions import (
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.score import build_metrics
+from acwm_interventions.interventions import (
     intervene,
     perturbed,
     predictability,
     simulator_of,
     units_of_work,
 )
-from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.score import build_metrics
 from tests import tiny
 from tests.evaluation.test_counterfactual import Episodes
 
@@ -125,7 +125,7 @@ def test_nothing_is_simulated_unless_it_is_asked_for(data, monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError
 
-    monkeypatch.setattr("acwm_core.evaluation.interventions.simulator_of", refuse)
+    monkeypatch.setattr("acwm_interventions.interventions.simulator_of", refuse)
     config = EvaluationConfig(counterfactual_episodes=0, perturbed_episodes=0, device="cpu")
     evaluator = Evaluator(None, tiny.Drift.card, {}, config)
     plans, episodes = {"ind_test": []}, {"ind_test": EpisodeDataset(data, "ind_test")}

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import rollout_run
+from acwm_interventions.evaluate import evaluate_run
 from tests import tiny
 
 RECIPE = {

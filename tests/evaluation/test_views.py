@@ -11,7 +11,6 @@ from PIL import Image
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.metric import Metric
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.storage import read_scores
@@ -20,6 +19,7 @@ from acwm_core.evaluation.views import metrics_of_views
 from acwm_core.training.run import load_run
 from acwm_dream.captions import HEIGHT
 from acwm_dream.rollout import rollout_run
+from acwm_interventions.evaluate import evaluate_run
 from acwm_metrics.fvd import FVD
 from acwm_metrics.pixel import SSIM
 from acwm_report.boards import boards_of

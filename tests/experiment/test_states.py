@@ -41,7 +41,7 @@ def parts():
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A dataset and an evaluated run of 7 steps, and the experiment that they are part of."""
-    from acwm_core.evaluation.evaluate import evaluate_run
+    from acwm_interventions.evaluate import evaluate_run
 
     folder = tmp_path_factory.mktemp("made")
     data = tiny.make_dataset(folder / "data", train=8, ind_test=2, ood_test=2)

@@ -2,10 +2,10 @@
 
 import pytest
 
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import compose
 from acwm_core.training.fit import fit
 from acwm_formats.arrays import Recording
+from acwm_interventions.evaluate import evaluate_run
 from acwm_report.run import EvaluatedRun
 from tests.formats.test_data_report import blob, written
 

@@ -14,7 +14,6 @@ from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import Clip, cut_episode, noise_seed, plan_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.protocol import Protocol
 from acwm_core.evaluation.results import Summary
@@ -22,6 +21,7 @@ from acwm_core.evaluation.score import build_metrics, score
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import summarise
 from acwm_core.training.run import load_run
+from acwm_interventions.evaluate import evaluate_run
 from acwm_phys.protocol import PublishedWindows
 from tests import tiny
 from tests.evaluation.by_hand import rollout, squared_error, true_clip

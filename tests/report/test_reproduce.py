@@ -8,9 +8,9 @@ import pytest
 
 from acwm_core.cli import main
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.evaluation.results import Summary
 from acwm_core.recipe import compose
+from acwm_interventions.evaluate import evaluate_run
 from acwm_report.page import write_report
 from acwm_report.reproduce import commands
 from acwm_severity.curves import read_severity

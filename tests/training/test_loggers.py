@@ -14,11 +14,11 @@ from tensorboard.backend.event_processing import event_accumulator
 
 from acwm_core import executors
 from acwm_core.errors import MissingExtraError, TrainingError
-from acwm_core.evaluation.evaluate import evaluate_run
 from acwm_core.recipe import Recipe
 from acwm_core.training.fit import fit
 from acwm_core.training.loggers import MetricsFile, build_loggers
 from acwm_core.training.run_folder import RunFolder
+from acwm_interventions.evaluate import evaluate_run
 from acwm_zoo.packing import pack
 from tests import tiny
 from tests.tiny import tiny_recipe

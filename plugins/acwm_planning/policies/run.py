@@ -18,13 +18,13 @@ from acwm_core.env.physics import StateEstimator
 from acwm_core.env.task import SolvedAtStartError, Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import as_clip
-from acwm_core.evaluation.counterfactual import plan_branches
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.score import estimator_for
 from acwm_core.executors import duration
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
+from acwm_interventions.counterfactual import plan_branches
 from acwm_planning.controllers import PolicyController
 from acwm_planning.episode import EpisodeResult, Start, load_task, spec_of_seed
 from acwm_planning.policies.episode import Outcome, read_outcome, true_outcome

@@ -23,8 +23,8 @@ from acwm_core.evaluation.clips import Clip, as_clip, read_clips
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Ensemble
-from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import ClipScores, Estimate, Values, finite
+from acwm_interventions.simulations import Again, simulate_again
 
 RESOLVED = 12**-0.5
 """Standard deviation, in pixels, of a place that is known up to the pixel in which it is."""

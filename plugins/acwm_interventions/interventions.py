@@ -15,7 +15,16 @@ from acwm_core.env.environment import Environment
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.evaluation.clips import Clip, as_clip, read_clips
 from acwm_core.evaluation.config import EvaluationConfig
-from acwm_core.evaluation.counterfactual import (
+from acwm_core.evaluation.metric import Metric, Prediction
+from acwm_core.evaluation.predict import Evaluator
+from acwm_core.evaluation.protocol import protocol_named
+from acwm_core.evaluation.results import Counterfactual, Ensemble, Predictability, Score
+from acwm_core.evaluation.score import build_metrics, score, split_available
+from acwm_core.evaluation.statistics import finite
+from acwm_core.evaluation.study import Clips
+from acwm_core.evaluation.videos import ShownClip
+from acwm_core.model.world_model import CLIP_FRAMES
+from acwm_interventions.counterfactual import (
     ROWS,
     counterfactual,
     max_branches,
@@ -23,16 +32,8 @@ from acwm_core.evaluation.counterfactual import (
     ratio,
     simulate_branches,
 )
-from acwm_core.evaluation.ensemble import compare_ensembles
-from acwm_core.evaluation.metric import Metric, Prediction
-from acwm_core.evaluation.predict import Evaluator
-from acwm_core.evaluation.protocol import protocol_named
-from acwm_core.evaluation.results import Counterfactual, Ensemble, Predictability, Score
-from acwm_core.evaluation.score import build_metrics, score, split_available
-from acwm_core.evaluation.simulations import Again, simulate_again
-from acwm_core.evaluation.statistics import finite
-from acwm_core.evaluation.videos import ShownClip
-from acwm_core.model.world_model import CLIP_FRAMES
+from acwm_interventions.ensemble import compare_ensembles
+from acwm_interventions.simulations import Again, simulate_again
 
 COUNTERFACTUAL, PERTURBED, ENSEMBLE = "counterfactual", "perturbed", "ensemble"
 """Names of the tests in `Summary.left_out`."""
@@ -43,9 +44,6 @@ TRIED_FRAMES = 8
 UNPREDICTABLE = 0.5
 """From this share on a frame counts as unpredictable: its squared error relative to that of
 repeating the first frame. Another episode of the same world has about 2, a perfect copy 0."""
-
-Clips = Mapping[str, Sequence[Clip]]
-"""Clips by split."""
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from acwm_core.evaluation.clips import Clip, Predictor, cut_episode, donor_actio
 from acwm_core.evaluation.metric import Metric, Prediction
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve
-from acwm_core.evaluation.simulations import Again, simulate_again
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
 from acwm_core.evaluation.summarise import summary_of
 from acwm_core.evaluation.videos import ShownClip, shown
+from acwm_interventions.simulations import Again, simulate_again
 
 SIZES = (0.1, 0.5)
 """Shifts of one action dimension, as fractions of half its range."""

@@ -1,0 +1,1 @@
+"""What only a simulator can answer: other actions, perturbed starts and ensembles of futures."""
