@@ -19,7 +19,8 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import PluginError, check_shape
 
 if TYPE_CHECKING:
-    from acwm_core.model.shapes import Clip
+    from jaxtyping import Float
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ class StateEstimator(ABC):
         return {}
 
     @abstractmethod
-    def estimate(self, video: Clip) -> Observation:
+    def estimate(self, video: Float[Tensor, "T 3 H W"]) -> Observation:
         """Estimate the masks of `instances` and the states `fields` of a video.
 
         Args:
@@ -244,7 +245,7 @@ class StateEstimator(ABC):
             ShapeError: the frames have another size.
         """
 
-    def read(self, video: Clip) -> Observation:
+    def read(self, video: Float[Tensor, "T 3 H W"]) -> Observation:
         """Call `estimate` and check its result; `PluginError` if it does not fit the video."""
         seen: Any = self.estimate(video)
         frames, _, *size = video.shape

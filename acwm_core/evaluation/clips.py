@@ -96,7 +96,7 @@ def sound_clips(
         DataError: fewer than two can be read, or as `plan_clips`.
     """
     split = episodes.split
-    chosen = protocol_named(config.protocol).episodes(len(episodes), config)
+    chosen = protocol_named(config.protocol).episodes(len(episodes), config.episodes)
     damage = {each: why for each in chosen if (why := episodes.damage(each))}
     if damage:
         first, why = next(iter(damage.items()))
@@ -127,7 +127,9 @@ def plan_clips(
             a clip that is not longer than its context frames.
     """
     protocol = protocol_named(config.protocol)
-    chosen = [each for each in protocol.episodes(len(lengths), config) if each not in without]
+    chosen = [
+        each for each in protocol.episodes(len(lengths), config.episodes) if each not in without
+    ]
     if len(chosen) < 2:
         raise DataError(
             f"{split} has {len(chosen)} episode(s), but evaluation needs two, to predict one with "
@@ -147,7 +149,7 @@ def plan_clips(
             given=given,
         )
         for number, (episode, donor) in enumerate(zip(chosen, donors, strict=True))
-        for start, frames in protocol.windows(lengths[episode], config)
+        for start, frames in protocol.windows(lengths[episode], config.frames, config.cuts)
     ]
     short = [clip for clip in clips if given > 1 and clip.frames <= given]
     if short:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from acwm_core.errors import AcwmWarning, RecipeError, sentence, suggest
 from acwm_core.plugins import catalog
-
-if TYPE_CHECKING:
-    from acwm_core.evaluation.config import EvaluationConfig
 
 FULL = "full"
 
@@ -90,13 +87,24 @@ class Protocol:
     cuts_windows: bool = False
     from_first_frame: bool = True
 
-    def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
-        """Indices of the episodes to use, of `count` in a split, ascending; here the first ones."""
-        return list(range(min(count, config.episodes or count)))
+    def episodes(self, count: int, wanted: int | None) -> list[int]:
+        """Indices of the episodes to use, ascending; here the first ones.
 
-    def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
-        """The clips of an episode of `length` frames: first frame and number of frames of each."""
-        return [(0, min(length, config.frames or length))]
+        Args:
+            count: number of episodes in the split.
+            wanted: at most so many, `evaluation.episodes`; None takes all.
+        """
+        return list(range(min(count, wanted or count)))
+
+    def windows(self, length: int, frames: int | None, cuts: int | None) -> list[tuple[int, int]]:
+        """The clips of an episode: first frame and number of frames of each.
+
+        Args:
+            length: number of frames of the episode.
+            frames: number of frames of a clip, `evaluation.frames`; None takes whole episodes.
+            cuts: number of clips, `evaluation.cuts`, if it `cuts_windows`.
+        """
+        return [(0, min(length, frames or length))]
 
     def tables(self) -> Mapping[str, PublishedTable]:
         """Published tables that were measured so, by name, the first to be searched first."""

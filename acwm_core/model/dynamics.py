@@ -5,16 +5,14 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 from torch import Generator, Tensor, nn
 
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.shapes import Latent, Sigmas
-
-if TYPE_CHECKING:
-    from acwm_core.model.objectives.objective import Batch
 
 InputKind = Literal["latent", "level"]
 """A further input of a denoiser: latents `[B, L, C, h, w]`, or a number in [0, 1] for each latent

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from acwm_core.evaluation.protocol import Protocol, PublishedTable
-
-if TYPE_CHECKING:
-    from acwm_core.evaluation.config import EvaluationConfig
 
 DRAW_SEED = 0
 """Seed of the published draw of episodes, independent of `evaluation.seed`."""
@@ -37,17 +34,17 @@ class PublishedWindows(Protocol):
 
         return published_tables()
 
-    def episodes(self, count: int, config: EvaluationConfig) -> list[int]:
+    def episodes(self, count: int, wanted: int | None) -> list[int]:
         """A fixed draw by Python's generator, ``random.Random(0).sample``."""
-        wanted = min(count, config.episodes or count)
-        return sorted(random.Random(DRAW_SEED).sample(range(count), wanted))
+        drawn = random.Random(DRAW_SEED).sample(range(count), min(count, wanted or count))
+        return sorted(drawn)
 
-    def windows(self, length: int, config: EvaluationConfig) -> list[tuple[int, int]]:
+    def windows(self, length: int, frames: int | None, cuts: int | None) -> list[tuple[int, int]]:
         """Windows that start at ``linspace(0, length − frames, cuts)``, rounded down.
 
         Duplicate starts, in episodes hardly longer than a window, are used once. An episode shorter
         than a window is a single, shorter clip.
         """
-        frames = min(length, config.frames or length)
-        starts = np.linspace(0, length - frames, config.cuts or 1).astype(int)
+        frames = min(length, frames or length)
+        starts = np.linspace(0, length - frames, cuts or 1).astype(int)
         return [(start, frames) for start in np.unique(starts).tolist()]

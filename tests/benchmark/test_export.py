@@ -121,7 +121,7 @@ def test_clips_of_the_published_release_are_scored_by_its_protocol(parts, tmp_pa
     words = ["evaluation.protocol=acwm-phys", "evaluation.metrics=[mse,psnr]"]
     tasks = export_tasks([], tmp_path / "tasks", data=tmp_path / "data", overrides=words)
     config = EvaluationConfig(protocol="acwm-phys", metrics=("mse",))
-    windows = protocol_named("acwm-phys").windows(40, config)
+    windows = protocol_named("acwm-phys").windows(40, config.frames, config.cuts)
     assert len(tasks.all) == 5 * len(windows)
     assert {task.frames for task in tasks.all} == {37}
     predictions = still(tasks.folder, tmp_path / "still")

@@ -28,11 +28,11 @@ class Ends(Protocol):
     defaults = MappingProxyType({"frames": 5, "steps": 1})
     from_first_frame = False
 
-    def episodes(self, count, config):
+    def episodes(self, count, wanted):
         return list(range(0, count, 2))
 
-    def windows(self, length, config):
-        return [(length - config.frames, config.frames)]
+    def windows(self, length, frames, cuts):
+        return [(length - frames, frames)]
 
     def tables(self):
         setting = {"env": "drift", "model": "big", "codec": "x", "conditioner": "y"}
