@@ -8,12 +8,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.recipe.types import NonNegativeInt, PositiveInt
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,28 +61,22 @@ class DataConfig:
     """
 
     path: str
-    batch_size: int = 16
-    clip_frames: int = 37
-    context_frames: int = 1
+    batch_size: PositiveInt = 16
+    clip_frames: Annotated[int, Ge(2)] = 37
+    context_frames: PositiveInt = 1
     clip_starts: Literal["anywhere", "episode"] = "anywhere"
-    window_stride: int = 4
-    fraction: float = 1.0
-    validation_episodes: int | None = None
+    window_stride: PositiveInt = 4
+    fraction: Annotated[float, Gt(0), Le(1)] = 1.0
+    validation_episodes: NonNegativeInt | None = None
     states: tuple[str, ...] = ()
     symmetries: bool = False
     growing: bool = False
     cache_latents: bool = True
-    workers: int = 0
+    workers: NonNegativeInt = 0
     reader: Literal["random_access", "webdataset"] = "random_access"
-    shuffle_buffer: int = 2000
+    shuffle_buffer: PositiveInt = 2000
 
     def __post_init__(self) -> None:
-        minima = {"batch_size": 1, "clip_frames": 2, "window_stride": 1, "workers": 0}
-        minima |= {"shuffle_buffer": 1, "validation_episodes": 0, "context_frames": 1}
-        for name, minimum in minima.items():
-            value = getattr(self, name)
-            if value is not None and value < minimum:
-                raise RecipeError(f"data.{name}={value} must be at least {minimum}")
         if self.states and self.reader != "random_access":
             raise RecipeError("data.states are read by data.reader=random_access only")
         if self.growing and (self.fraction != 1 or self.reader != "random_access"):
@@ -88,8 +84,6 @@ class DataConfig:
                 "data.growing takes all that there is by data.reader=random_access: leave out "
                 "data.fraction and data.reader, or data.growing"
             )
-        if not 0 < self.fraction <= 1:
-            raise RecipeError(f"data.fraction={self.fraction} must be above 0 and at most 1")
 
 
 def window_starts(length: int, frames: int, stride: int) -> range:

@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge
 
 from acwm_core.env.episode import SPLITS
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.evaluation.protocol import protocol_named
 from acwm_core.recipe.metrics import metric_configs
+from acwm_core.recipe.types import NonNegativeInt, PositiveInt
 
-MINIMA = {
-    **dict.fromkeys(("frames", "sweep_episodes", "severity_episodes", "episodes"), 2),
-    **dict.fromkeys(("cuts", "steps", "batch_size", "context_frames", "samples"), 1),
-    **dict.fromkeys(("seed", "videos", "counterfactual_episodes"), 0),
-    **dict.fromkeys(("noise_floor_episodes", "perturbed_episodes", "ensemble_episodes"), 0),
-    "ensemble_starts": 4,
-}
-"""The smallest allowed value of each setting that is not None."""
+Several = Annotated[int, Ge(2)]
 
 
 @dataclass(frozen=True)
@@ -80,26 +76,26 @@ class EvaluationConfig:
     protocol: str = "full"
     metrics: tuple[str | dict[str, Any], ...] = ()
     metric_options: dict[str, dict[str, Any]] | None = None
-    frames: int | None = None
+    frames: Several | None = None
     mode: Literal["stream", "windows", "whole"] | None = None
-    context_frames: int | None = None
-    cuts: int | None = None
-    steps: int | None = None
-    samples: int = 1
-    steps_sweep: tuple[int, ...] = (1, 2, 4, 5, 10, 20, 50)
-    sweep_episodes: int = 4
-    batch_size: int = 8
-    seed: int = 0
+    context_frames: PositiveInt | None = None
+    cuts: PositiveInt | None = None
+    steps: PositiveInt | None = None
+    samples: PositiveInt = 1
+    steps_sweep: tuple[PositiveInt, ...] = (1, 2, 4, 5, 10, 20, 50)
+    sweep_episodes: Several = 4
+    batch_size: PositiveInt = 8
+    seed: NonNegativeInt = 0
     splits: tuple[str, ...] | None = None
-    episodes: int | None = None
-    videos: int = 1
+    episodes: Several | None = None
+    videos: NonNegativeInt = 1
     counterfactual_metrics: tuple[str | dict[str, Any], ...] = ()
-    counterfactual_episodes: int = 2
-    noise_floor_episodes: int = 8
-    perturbed_episodes: int = 8
-    ensemble_episodes: int = 0
-    ensemble_starts: int = 16
-    severity_episodes: int = 16
+    counterfactual_episodes: NonNegativeInt = 2
+    noise_floor_episodes: NonNegativeInt = 8
+    perturbed_episodes: NonNegativeInt = 8
+    ensemble_episodes: NonNegativeInt = 0
+    ensemble_starts: Annotated[int, Ge(4)] = 16
+    severity_episodes: Several = 16
     device: str = "auto"
 
     def __post_init__(self) -> None:
@@ -118,22 +114,15 @@ class EvaluationConfig:
         object.__setattr__(self, "steps_sweep", tuple(sorted({*self.steps_sweep})))
         if self.splits is not None:
             object.__setattr__(self, "splits", tuple(self.splits))
-        self._require("splits", self.splits != (), "must name at least one")
+        if self.splits == ():
+            raise RecipeError("evaluation.splits=() must name at least one")
         for split in self.splits or ():
             if split not in SPLITS:
                 raise RecipeError(f"evaluation.splits: unknown {split!r}{suggest(split, SPLITS)}")
-        for name, least in MINIMA.items():
-            value = getattr(self, name)
-            self._require(name, value is None or value >= least, f"must be at least {least}")
-        self._require("steps_sweep", min(self.steps_sweep, default=1) >= 1, "must be at least 1")
 
     def to_dict(self) -> dict[str, Any]:
         """The parameters as plain JSON types."""
         return json.loads(json.dumps(asdict(self)))
-
-    def _require(self, name: str, holds: bool, what: str) -> None:
-        if not holds:
-            raise RecipeError(f"evaluation.{name}={getattr(self, name)} {what}")
 
 
 def setting_overrides(given: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:

@@ -52,7 +52,7 @@ def signature(target: Callable[..., Any]) -> Signature:
 def _named(typed: Any, taken: inspect.Signature) -> tuple[dict[str, Parameter], bool]:
     """The parameters that have a name, with the types of `typed`; and whether there may be more."""
     try:
-        types = get_type_hints(typed)
+        types = get_type_hints(typed, include_extras=True)
     except Exception:  # it names what only type checkers import
         types = dict[str, Any]()
     parameters = taken.parameters.values()

@@ -5,10 +5,20 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections.abc import Sequence
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
 
 from acwm_core.errors import RecipeError
+
+NonNegativeInt = Annotated[int, Ge(0)]
+PositiveInt = Annotated[int, Ge(1)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+FractionBelowOne = Annotated[float, Ge(0), Lt(1)]
+
+_BOUNDS = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
 
 
 def checked(where: str, value: Any, expected: Any) -> Any:
@@ -18,9 +28,10 @@ def checked(where: str, value: Any, expected: Any) -> Any:
 
     Args:
         where: the parameter, e.g. ``"model.layers"``, for the message.
+        expected: a type, whose ranges are those of ``Annotated[int, Ge(1)]``.
 
     Raises:
-        RecipeError: the value has another type.
+        RecipeError: the value has another type, or is out of range.
     """
     import pydantic  # 60 ms, and only if a recipe sets something
 
@@ -30,7 +41,11 @@ def checked(where: str, value: Any, expected: Any) -> Any:
         return value
     try:
         return adapter.validate_json(json.dumps(value), strict=True)
-    except pydantic.ValidationError:
+    except pydantic.ValidationError as error:
+        context = error.errors(include_url=False)[0].get("ctx", {})
+        for kind, words in _BOUNDS.items():
+            if (limit := context.get(kind.__name__.lower())) is not None:
+                raise RecipeError(f"{where}={show(value)} must be {words} {limit:g}") from None
         wanted = describe(expected)
         near = difflib.get_close_matches(str(value), re.findall("'(.+?)'", wanted), 1, cutoff=0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -45,8 +60,13 @@ def show(value: Any) -> str:
 
 
 def describe(expected: Any) -> str:
-    """Describe a type: ``int or null``, ``'velocity' or 'clean'``, ``[str, …]`` for a list."""
+    """Describe a type: ``int or null``, ``'velocity' or 'clean'``, ``[str, …]`` for a list.
+
+    A range follows its type: ``int at least 1``.
+    """
     origin, arguments = get_origin(expected), get_args(expected)
+    if origin is Annotated:
+        return _with_range(arguments[0], arguments[1:])
     if origin is Literal:
         return " or ".join(map(repr, arguments))
     if origin in (Union, UnionType):
@@ -60,3 +80,13 @@ def describe(expected: Any) -> str:
     if origin in (list, tuple):  # as written in YAML
         return f"[{', '.join(inner)}]"
     return f"{name}[{', '.join(inner)}]" if inner else name
+
+
+def _with_range(base: Any, metadata: Sequence[Any]) -> str:
+    limits = [
+        f"{words} {getattr(each, kind.__name__.lower()):g}"
+        for each in metadata
+        for kind, words in _BOUNDS.items()
+        if isinstance(each, kind)
+    ]
+    return " ".join([describe(base), *limits[:1], *(f"and {limit}" for limit in limits[1:])])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
+
+from annotated_types import Ge, Gt
 
 from acwm_core.errors import RecipeError, unknown_name
+from acwm_core.recipe.types import Fraction, FractionBelowOne, NonNegativeInt, PositiveInt
 
 LOGGERS = {"csv": "", "tensorboard": "", "wandb": "WandbLogger", "mlflow": "MLFlowLogger"}
 """Names that `trainer.logger` accepts, with Lightning's class; the first two are built in."""
@@ -101,56 +104,32 @@ class TrainingConfig:
     """
 
     optimizer: Literal["adamw", "muon"] = "adamw"
-    learning_rate: float = 1e-4
-    weight_decay: float = 0.01
-    betas: tuple[float, float] = (0.9, 0.999)
-    warmup_steps: int = 0
+    learning_rate: Annotated[float, Gt(0)] = 1e-4
+    weight_decay: Annotated[float, Ge(0)] = 0.01
+    betas: tuple[FractionBelowOne, FractionBelowOne] = (0.9, 0.999)
+    warmup_steps: NonNegativeInt = 0
     schedule: Literal["constant", "linear", "cosine"] = "constant"
-    decay_start: float = 0.0
-    growing_horizon: float = 0.0
-    random_starts: float = 0.0
-    agent_steps: int = 0
-    ema_decay: float = 0.999
+    decay_start: FractionBelowOne = 0.0
+    growing_horizon: Fraction = 0.0
+    random_starts: Fraction = 0.0
+    agent_steps: NonNegativeInt = 0
+    ema_decay: FractionBelowOne = 0.999
     init_from: str | None = None
     ignore_mismatched_sizes: bool = False
-    seed: int = 0
+    seed: NonNegativeInt = 0
     compile: bool = False
     activation_checkpointing: bool = False
-    cpu_threads: int | None = None
-    validate_every_n_steps: int = 500
-    validation_rollouts: int = 4
-    checkpoint_every_n_steps: int = 500
-    sample_every_n_steps: int = 2000
-    sample_videos: int = 4
+    cpu_threads: PositiveInt | None = None
+    validate_every_n_steps: PositiveInt = 500
+    validation_rollouts: NonNegativeInt = 4
+    checkpoint_every_n_steps: PositiveInt = 500
+    sample_every_n_steps: NonNegativeInt = 2000
+    sample_videos: PositiveInt = 4
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "betas", tuple(self.betas))  # YAML gives lists
-        threads = self.cpu_threads
-        for name, holds, what in (
-            ("learning_rate", self.learning_rate > 0, "must be positive"),
-            ("weight_decay", self.weight_decay >= 0, "must not be negative"),
-            ("betas", len(self.betas) == 2, "must be two numbers"),
-            ("betas", all(0 <= beta < 1 for beta in self.betas), "must lie in [0, 1)"),
-            ("warmup_steps", self.warmup_steps >= 0, "must not be negative"),
-            ("optimizer", self.optimizer in ("adamw", "muon"), "is unknown"),
-            ("schedule", self.schedule in ("constant", "linear", "cosine"), "is unknown"),
-            ("decay_start", 0 <= self.decay_start < 1, "must lie in [0, 1)"),
-            ("growing_horizon", 0 <= self.growing_horizon <= 1, "must lie in [0, 1]"),
-            ("random_starts", 0 <= self.random_starts <= 1, "must lie in [0, 1]"),
-            ("agent_steps", self.agent_steps >= 0, "must be 0 or more"),
-            ("ema_decay", 0 <= self.ema_decay < 1, "must lie in [0, 1)"),
-            (
-                "ignore_mismatched_sizes",
-                self.init_from is not None or not self.ignore_mismatched_sizes,
-                "goes with training.init_from=RUN, whose weights it is about",
-            ),
-            ("seed", self.seed >= 0, "must not be negative"),
-            ("cpu_threads", threads is None or threads >= 1, "must be at least 1"),
-            ("validate_every_n_steps", self.validate_every_n_steps >= 1, "must be at least 1"),
-            ("checkpoint_every_n_steps", self.checkpoint_every_n_steps >= 1, "must be at least 1"),
-            ("sample_videos", self.sample_videos >= 1, "must be at least 1"),
-            ("sample_every_n_steps", self.sample_every_n_steps >= 0, "must be 0 or more"),
-            ("validation_rollouts", self.validation_rollouts >= 0, "must be 0 or more"),
-        ):
-            if not holds:
-                raise RecipeError(f"training.{name}={getattr(self, name)} {what}")
+        if self.ignore_mismatched_sizes and self.init_from is None:
+            raise RecipeError(
+                "training.ignore_mismatched_sizes=True goes with training.init_from=RUN, whose "
+                "weights it is about"
+            )

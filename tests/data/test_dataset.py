@@ -11,7 +11,6 @@ from conftest import EPISODES
 
 from acwm_core.data.clips import (
     ClipDataset,
-    DataConfig,
     hold_out,
     list_windows,
     take_fraction,
@@ -20,6 +19,7 @@ from acwm_core.data.clips import (
 from acwm_core.data.dataset import EpisodeDataset, Manifest
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.recipe.check import check_section
 
 
 def test_every_episode_is_its_specs(square_data):
@@ -183,4 +183,4 @@ def test_equal_data_has_equal_checksums(square_data):
 )
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(RecipeError, match=rf"data.{next(iter(wrong))}="):
-        DataConfig("data/square", **wrong)
+        check_section("data", {"path": "data/square", **wrong})

@@ -15,6 +15,7 @@ from acwm_core.evaluation.clips import (
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.metric import Prediction
 from acwm_core.evaluation.predict import Evaluator
+from acwm_core.recipe.check import check_section
 from tests.tiny import pointwise_world_model
 
 
@@ -127,4 +128,4 @@ def test_rows_predict_what_they_are_named_after():
 )
 def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(RecipeError, match=message):
-        EvaluationConfig(**settings)
+        check_section("evaluation", settings)

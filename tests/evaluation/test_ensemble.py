@@ -17,6 +17,7 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.score import build_metrics
+from acwm_core.recipe.check import check_section
 from acwm_interventions.ensemble import (
     RESOLVED,
     compare_ensembles,
@@ -144,7 +145,7 @@ def test_a_model_that_doubts_as_the_world_does_is_as_near_as_the_world_itself():
 def test_the_test_is_off_and_is_left_out_where_starts_cannot_be_moved(data):
     assert EvaluationConfig().ensemble_episodes == 0
     with pytest.raises(RecipeError, match="ensemble_starts"):
-        EvaluationConfig(ensemble_starts=3)
+        check_section("evaluation", {"ensemble_starts": 3})
     config = EvaluationConfig(ensemble_episodes=1, perturbed_episodes=0, device="cpu")
     evaluator = Evaluator(None, tiny.Drift.card, {}, config)
     plans = {"ind_test": [Clip("ind_test", 0, 0, 13)]}

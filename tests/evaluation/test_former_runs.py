@@ -19,22 +19,22 @@ FEW += ("perturbed_episodes=0", "noise_floor_episodes=0", "ensemble_episodes=0",
 
 
 @pytest.mark.parametrize(
-    "run",
+    ("run", "samples"),
     [
-        "before_objectives/diffusion_forcing",
-        "before_objectives/next_frame",
-        "before_objectives/recurrent",
-        "second_release/run",
+        ("before_objectives/diffusion_forcing", 1),
+        ("before_objectives/next_frame", 1),
+        ("before_objectives/recurrent", 1),
+        ("second_release/run", 2),
     ],
 )
-def test_a_run_gets_the_same_scores(run, tmp_path):
+def test_a_run_gets_the_same_scores(run, samples, tmp_path):
     release, name = run.split("/")
     for folder in ("data", name):
         shutil.copytree(FORMER / release / folder, tmp_path / folder)
     run = tmp_path / name
     before = json.loads((run / "evaluation/summary.json").read_text())["splits"]["ind_test"]
     shutil.rmtree(run / "evaluation")
-    options = [f"evaluation.{option}" for option in FEW]
+    options = [f"evaluation.{option}" for option in (*FEW, f"samples={samples}")]
     words = ["evaluate", str(run), "--data", str(tmp_path / "data"), *options]
     outcome = CliRunner().invoke(main, words)
     assert outcome.exit_code == 0, outcome.output

@@ -20,6 +20,7 @@ from acwm_core.evaluation.results import Summary
 from acwm_core.evaluation.score import build_metrics, score
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.evaluation.summarise import summarise
+from acwm_core.recipe.check import check_section
 from acwm_core.training.run import load_run
 from acwm_interventions.evaluate import evaluate_run
 from acwm_phys.protocol import PublishedWindows
@@ -191,7 +192,7 @@ def test_the_sweep_over_steps_takes_one_window_of_each_episode(data, tmp_path):
 )
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(RecipeError, match=message):
-        EvaluationConfig(**settings)
+        check_section("evaluation", settings)
 
 
 def test_published_values_come_out_of_the_summary(card):

@@ -94,7 +94,7 @@ WRONG = {
     "codec=nowhere": "but tests.recipe.test_recipe has no 'Missing'",
     "codec=": "names no codec; add codec=NAME",
     "training=5": "training=5: give parameters, as in training.parameter=value",
-    "training.learning_rate=-1": "training.learning_rate=-1.0 must be positive",
+    "training.learning_rate=-1": "training.learning_rate=-1 must be above 0",
     "training.max_steps=10": "has no parameter 'max_steps'; did you mean trainer.max_steps?",
     "model.learning_rate=1": "'learning_rate'; did you mean training.learning_rate?",
     "data.batch_size=0": "data.batch_size=0 must be at least 1",

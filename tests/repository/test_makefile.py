@@ -1,14 +1,12 @@
 """The Makefile says in one sentence what is missing on a bare machine."""
 
 import os
-import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[2]
 MAKE = shutil.which("make")
@@ -99,12 +97,3 @@ def test_install_says_what_it_does_and_what_comes_next(tmp_path):
     assert "acwm[all,dev,docs]" in rest
     assert f"source {folder}/activate" in done
     assert make("install", f"VENV={tmp_path / 'venv'}").stdout.splitlines() == [done]
-
-
-def test_the_decoder_learns_from_the_models_that_predict_its_latents():
-    """One on other latents would be refused, after hours."""
-    named = re.findall(r"--predicted-by (\w+)", make("-n", "decoders").stdout)
-    shipped = (ROOT / "plugins" / "acwm_zoo" / "models").glob("*/recipe.yaml")
-    codecs = {path.parent.name: yaml.safe_load(path.read_text())["codec"] for path in shipped}
-    fitting = {name for name, codec in codecs.items() if codec["name"].startswith("compact")}
-    assert {*named} == fitting - {"push_cube_128", "push_cube_draws"}  # drawn as push_cube is

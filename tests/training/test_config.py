@@ -1,7 +1,7 @@
 import pytest
 
 from acwm_core.errors import RecipeError
-from acwm_core.recipe.check import check_names
+from acwm_core.recipe.check import check_names, check_section
 from acwm_core.training.config import TrainingConfig
 
 
@@ -28,7 +28,7 @@ from acwm_core.training.config import TrainingConfig
 )
 def test_impossible_values_are_refused_by_name(name, value):
     with pytest.raises(RecipeError, match=rf"training\.{name}="):
-        TrainingConfig(**{name: value})
+        check_section("training", {name: value})
 
 
 def test_lists_from_yaml_become_tuples():
