@@ -77,25 +77,18 @@ def evaluate_run(
 ) -> Summary:
     """Predict and score every test clip of a run's dataset, and write the results.
 
-    The model is compared with three reference rows on the same clips: a copy of the first frame,
-    the model with another episode's actions, and the codec's reconstruction. The same run, data and
-    settings give the same numbers, whatever the batch size (up to float32 rounding).
-
-    Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``. A result of
-    other weights with the same settings is replaced.
-
     Args:
         run: the run folder, or the name of a trained model.
         data: the data folder; the recipe's by default.
-        overrides: changes to the section `evaluation` of the run's recipe
-            (``evaluation.steps=10``).
-        out: a folder to write to instead of `run`; it can be reported and compared like a run.
+        overrides: changes to the section `evaluation` of the run's recipe.
+        out: a folder to write to instead of `run`.
         overwrite: replace a result that was made with other settings, or on other data.
         progress: show a progress bar on the terminal.
         studies: what is measured besides, e.g. with the simulator.
 
     Returns:
-        The content of ``summary.json``.
+        The content of ``summary.json``, which is in ``RUN/evaluation/`` with ``episodes.parquet``
+        and ``videos/``.
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation import evaluate
@@ -41,15 +40,39 @@ STUDIES = (SimulatorStudy(),)
 """What `acwm evaluate` does besides."""
 
 
-def evaluate_run(run: str | Path, *, overrides: Sequence[str] = (), **options: Any) -> Summary:
-    """`acwm_core.evaluation.evaluate.evaluate_run`, with `STUDIES`.
+def evaluate_run(
+    run: str | Path,
+    *,
+    data: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Summary:
+    """Predict and score every test clip of a run's dataset, and write the results.
 
-    If the simulator is installed, it also shows for a few clips what other actions would do, and
-    gives the predictability horizon.
+    The model is compared with three reference rows on the same clips: a copy of the first frame,
+    the model with another episode's actions, and the codec's reconstruction. If the simulator is
+    installed, it also shows for a few clips what other actions would do, and gives the
+    predictability horizon. The same run, data and settings give the same numbers, whatever the
+    batch size (up to float32 rounding).
+
+    Writes ``RUN/evaluation/``: ``episodes.parquet``, ``summary.json`` and ``videos/``. A result of
+    other weights with the same settings is replaced.
 
     Args:
         run: the run folder, or the name of a trained model.
-        overrides: changes to the section `evaluation` of the run's recipe.
-        **options: further arguments of that function.
+        data: the data folder; the recipe's by default.
+        overrides: changes to the section `evaluation` of the run's recipe
+            (``evaluation.steps=10``).
+        out: a folder to write to instead of `run`; it can be reported and compared like a run.
+        overwrite: replace a result that was made with other settings, or on other data.
+        progress: show a progress bar on the terminal.
+
+    Returns:
+        The content of ``summary.json``.
     """
-    return evaluate.evaluate_run(run, overrides=overrides, studies=STUDIES, **options)
+    where = {"data": data, "overrides": overrides, "out": out}
+    return evaluate.evaluate_run(
+        run, **where, overwrite=overwrite, progress=progress, studies=STUDIES
+    )
