@@ -72,7 +72,12 @@ def evaluate_run(
     Returns:
         The content of ``summary.json``.
     """
-    where = {"data": data, "overrides": overrides, "out": out}
     return evaluate.evaluate_run(
-        run, **where, overwrite=overwrite, progress=progress, studies=STUDIES
+        run,
+        data=data,
+        overrides=overrides,
+        out=out,
+        overwrite=overwrite,
+        progress=progress,
+        studies=STUDIES,
     )
