@@ -33,7 +33,7 @@ def horizon_charts(run: EvaluatedRun, metric: str) -> list[Chart]:
                 seconds = [(n + 1) / run.summary.environment["fps"] for n in range(len(values))]
                 style = "--" if kind in ("codec", "truth") else "-"
                 scaled = _times(values, scale.factor)
-                curves.append(Curve(ROWS[kind][0], kind, seconds, scaled, style))
+                curves.append(Curve(ROWS[kind].title, kind, seconds, scaled, style))
         if metric != run.summary.headline:
             title = f"{info.title}, {title.lower()}"
             name = f"{run.key}-horizon-{metric.replace('_', '-')}-{split}"
@@ -102,7 +102,7 @@ def response_charts(run: EvaluatedRun) -> list[Chart]:
             curves = [Curve("Simulator", "truth", seconds, _times(curve.truth, 1000), "--")]
             for kind in [each for each in ("codec", "perturbed", "model") if each in curve.rows]:
                 values = _times(curve.rows[kind], 1000)
-                curves.append(Curve(ROWS[kind][0], kind, seconds, values))
+                curves.append(Curve(ROWS[kind].title, kind, seconds, values))
             shift = f"{curve.dimension.replace('_', ' ')} shifted by {curve.shift:.2g} {curve.unit}"
             title, name = f"{split_title(split)}: {shift}", f"{run.key}-response-{split}-{number}"
             charts.append(Chart(title, name, curves, SECONDS, "response (×10⁻³)"))
@@ -182,7 +182,7 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
         ends = [[each.value, each.low, each.high] for each in row]
         values, low, high = (_times(column, scale.factor) for column in zip(*ends, strict=True))
         style = "--" if kind == "codec" else "-"
-        curves.append(Curve(ROWS[kind][0], kind, places, values, style, low, high))
+        curves.append(Curve(ROWS[kind].title, kind, places, values, style, low, high))
     name = curve.factor.replace("_", " ")
     title, file = f"{name}, {curve.episodes} episodes each", f"{key}-severity-{curve.factor}"
     axes = f"{name} ({curve.unit})" if curve.unit else name, _axis(info, scale)

@@ -23,7 +23,7 @@ from acwm_report.draws import draws_phrase
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale, Table
 from acwm_report.titles import (
-    BESIDE,
+    COLUMNS,
     ENSEMBLE_ROWS,
     ROWS,
     branch_title,
@@ -63,7 +63,7 @@ def _score_rows(
     """The scores of a split in one view; ``""`` is the whole frame."""
     result = run.summary.splits[split].scores
     names = {of_view(name, view): scale for name, scale in scales.items()}
-    for kind, (row, note) in ROWS.items():
+    for kind, (row, _, note) in ROWS.items():
         scores = result.rows.get(kind, {})
         cells = [Cell.of(scores.get(name), scale) for name, scale in names.items()]
         if any(cell.value is not None for cell in cells):
@@ -87,7 +87,7 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
     for split, result in run.summary.splits.items():
         rows: list[Row] = []
         scores, shares = result.scores.rows, result.scores.shares.get("model", {})
-        kinds = [kind for kind in BESIDE if _defined(scores.get(kind, {}), run.metrics("states"))]
+        kinds = [kind for kind in COLUMNS if _defined(scores.get(kind, {}), run.metrics("states"))]
         for name in run.metrics("states"):
             info, scale = run.summary.metrics[name], run.scale(name)
             way = "higher is better" if info.higher_is_better else "lower is better"
@@ -102,7 +102,7 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
                     Row(info.title, cells, ", ".join(filter(None, (scale.unit, way, left_out))))
                 )
         if rows and run.metrics("pixels"):
-            columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
+            columns = [Column(ROWS[kind].short.capitalize(), key=kind) for kind in kinds]
             if shares:
                 columns.insert(1, Column("Scored", PERCENT.unit, key="scored"))
             title = _title(split, result)
@@ -122,7 +122,7 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
     """One table per split: the response to each kind of other actions, a column per prediction."""
     tables: list[Table] = []
     for split, found in counterfactuals(run.summary).items():
-        kinds = [kind for kind in BESIDE if kind in found.rows]
+        kinds = [kind for kind in COLUMNS if kind in found.rows]
         named = {name: MetricInfo("", higher_is_better=True) for name in found.rows[kinds[0]]}
         rows: list[Row] = []
         for metric, info in described(named).items():
@@ -133,7 +133,7 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
                 note = f"model: gain {gain}, residual {rest}" if MISSING not in (gain, rest) else ""
                 title = info.title if branch == "all" else branch_title(branch)
                 rows.append(Row(title, cells, note, strong=branch == "all"))
-        columns = [Column(BESIDE[kind], key=kind) for kind in kinds]
+        columns = [Column(ROWS[kind].short.capitalize(), key=kind) for kind in kinds]
         title = f"{split_title(split)} · {found.branches} branches of {found.clips} clips"
         tables.append(Table(title, columns, rows, "Other actions", name=f"response-{split}"))
     return tables

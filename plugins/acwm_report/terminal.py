@@ -10,6 +10,7 @@ import click
 
 from acwm_core.cli.tables import plain_table, print_table
 from acwm_report.draws import draws_phrase
+from acwm_report.titles import short_title
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,19 +28,6 @@ if TYPE_CHECKING:
     from acwm_report.comparison import Comparison, Difference
     from acwm_report.table import Table as PageTable
     from acwm_severity.curves import SeverityCurve
-
-ROWS = {
-    "model": "model",
-    "mean_of_draws": "mean frames",
-    "best_of_draws": "best draw",
-    "shuffled": "other actions",
-    "copy": "first frame",
-    "codec": "codec alone",
-    "truth": "noise floor",
-    "perturbed": "other start",
-}
-"""Names of the result rows, as the tables show them."""
-
 
 SHORT = {"In distribution": "InD", "Out of distribution": "OoD"}
 """Short names of splits, for tables whose eight columns must fit a terminal."""
@@ -83,7 +71,7 @@ def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
     if found := error_shares(scores):
         click.echo(f"{found}{f' ({better})' if found.codec > MUCH else ''}")
     for row in scores.failed:
-        failures = f"{ROWS.get(row, row)}: {scores.failures(row)}"
+        failures = f"{short_title(row)}: {scores.failures(row)}"
         click.echo(f"{failures}: their scores count as infinitely bad")
     undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
     if text := ", ".join(undefined):
@@ -132,7 +120,7 @@ def _split_table(
     clips = f"{scores.clips} clips"
     if scores.episodes != scores.clips:
         clips += f" of {scores.episodes} episodes"
-    heads = [ROWS.get(row, row) for row in scores.rows]
+    heads = [short_title(row) for row in scores.rows]
     shares = scores.shares.get("model", {})
     place = list(scores.rows).index("model") + 1
     if shares:
@@ -171,7 +159,8 @@ def _print_curves(summary: Summary) -> None:
 
 
 def _print_ensemble(split: str, found: Ensemble) -> None:
-    named = {**ROWS, "simulator": "simulator, half against half"}
+    named = {row: short_title(row) for row in found.distance}
+    named["simulator"] = "simulator, half against half"
     away, apart = (
         ", ".join(f"{named[row]} {_text(each, interval=False)}" for row, each in of.items())
         for of in (found.distance, found.spread)

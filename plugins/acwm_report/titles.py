@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from acwm_core.evaluation.results import SetSummary
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from acwm_core.evaluation.results import SetSummary
 
 SPLITS = {
     "train": "Training episodes",
@@ -12,30 +15,44 @@ SPLITS = {
 """Titles of the splits."""
 
 
+class RowTitle(NamedTuple):
+    """What a row of an evaluation is called."""
+
+    title: str  # of a line in a table
+    short: str  # of a column, and on the terminal
+    about: str
+
+
 ROWS = {
-    "truth": ("True video", "the noise floor: the error of the estimator of states"),
-    "codec": ("Codec reconstruction", "the ceiling: the truth, encoded and decoded"),
-    "perturbed": ("Simulator, perturbed", "started a millimetre off; few clips"),
-    "model": ("Model, true actions", "what is being evaluated"),
-    "mean_of_draws": ("Model, mean of its draws", "the mean frames; what is unsure is a haze"),
-    "best_of_draws": ("Model, best of its draws", "in each metric the best draw of each clip"),
-    "shuffled": ("Model, other actions", "same model and noise, another episode’s actions"),
-    "copy": ("First frame, copied", "a prediction in which nothing moves"),
+    "truth": RowTitle(
+        "True video", "noise floor", "the noise floor: the error of the estimator of states"
+    ),
+    "codec": RowTitle(
+        "Codec reconstruction", "codec alone", "the ceiling: the truth, encoded and decoded"
+    ),
+    "perturbed": RowTitle(
+        "Simulator, perturbed", "other start", "started a millimetre off; few clips"
+    ),
+    "model": RowTitle("Model, true actions", "model", "what is being evaluated"),
+    "mean_of_draws": RowTitle(
+        "Model, mean of its draws", "mean frames", "the mean frames; what is unsure is a haze"
+    ),
+    "best_of_draws": RowTitle(
+        "Model, best of its draws", "best draw", "in each metric the best draw of each clip"
+    ),
+    "shuffled": RowTitle(
+        "Model, other actions", "other actions", "same model and noise, another episode’s actions"
+    ),
+    "copy": RowTitle("First frame, copied", "first frame", "a prediction in which nothing moves"),
 }
-"""Title and explanation of every row of an evaluation, in table order."""
+"""The names of every row of an evaluation, in table order."""
 
 
-BESIDE = {
-    "model": "Model",
-    "mean_of_draws": "Mean of draws",
-    "best_of_draws": "Best of draws",
-    "truth": "Noise floor",
-    "codec": "Codec",
-    "perturbed": "Perturbed",
-    "shuffled": "Other actions",
-    "copy": "First frame",
-}
-"""Short titles of the rows where they are table columns: the scores first, then their floors."""
+COLUMNS = (
+    *("model", "mean_of_draws", "best_of_draws"),
+    *("truth", "codec", "perturbed", "shuffled", "copy"),
+)
+"""The order of rows where they are table columns: the scores first, then their bounds."""
 
 
 ENSEMBLE_ROWS = {
@@ -81,3 +98,8 @@ def clips_title(scores: SetSummary) -> str:
     if scores.episodes in (0, scores.clips):
         return f"{scores.clips} episodes"
     return f"{scores.clips} clips of {scores.episodes} episodes"
+
+
+def short_title(row: str) -> str:
+    """The short name of a row of an evaluation, as ``codec alone``."""
+    return ROWS[row].short if row in ROWS else row

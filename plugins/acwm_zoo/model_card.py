@@ -16,15 +16,11 @@ from acwm_core.evaluation.shares import error_shares
 from acwm_core.recipe import Recipe
 from acwm_core.training.run import read_metadata
 from acwm_core.training.run_folder import RunFolder
+from acwm_report.titles import short_title
 
 SPLITS = {"ind_test": "in distribution", "ood_test": "out of distribution"}
 
-ROWS = {
-    "model": "model",
-    "codec": "codec alone",
-    "perturbed": "simulator from a slightly different start",
-    "copy": "first frame",
-}
+BESIDE = ("model", "codec", "perturbed", "copy")
 """The rows that stand beside each other at the end of a card."""
 
 CURVE_POINTS = 8
@@ -150,7 +146,7 @@ def _ceilings(summary: Summary) -> str:
     lines: list[str] = []
     for split, result in summary.splits.items():
         rows = {row: found.get(summary.headline) for row, found in result.scores.rows.items()}
-        beside = [f"{title} {_shown(rows[row])}" for row, title in ROWS.items() if row in rows]
+        beside = [f"{short_title(row)} {_shown(rows[row])}" for row in BESIDE if row in rows]
         text = f"{summary.metrics[summary.headline].title} {SPLITS.get(split, split)}: "
         parts = error_shares(result.scores)
         lines.append(f"- {text}{', '.join(beside)}{f'. Approximate {parts}' if parts else ''}.\n")
