@@ -199,7 +199,7 @@ def _normal(section: str, value: Any) -> Any:
     """Expand the short form ``model: dit_s``."""
     if section in COMPONENTS and value is not None and not isinstance(value, Mapping):
         return {"name": value}
-    return value
+    return value  # pyright: ignore[reportUnknownVariableType]
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

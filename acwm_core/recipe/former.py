@@ -41,4 +41,4 @@ def _objective(flow: Any, given: Any) -> Any:
         values = {"name": values.pop("objective"), FOLLOWS: True, **values}
         if values["name"] != "next_frame":  # others had these parameters too, without an effect
             values = {key: v for key, v in values.items() if key not in ("past_noise", "own_past")}
-    return {**values, **(given or {})}
+    return {**values, **cast(Mapping[str, Any], given or {})}

@@ -11,8 +11,9 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from tests.checks.results import failures
+from tests.extras import needs
 
-pytest.importorskip("diffusers")
+pytestmark = needs("diffusers")
 
 KINDS = ("autoencoder_kl", "autoencoder_tiny", "autoencoder_dc")
 

@@ -19,8 +19,9 @@ from acwm_core.model.build import build_world_model
 from acwm_core.plugins import catalog
 from acwm_core.recipe import compose
 from tests.codecs.tiny_autoencoders import original_state, save_tiny_codecs, tiny_flux, tiny_wan
+from tests.extras import needs
 
-pytest.importorskip("diffusers")
+pytestmark = needs("diffusers")
 
 NAMES = ("wan", "wan_per_frame", "flux")
 TENSORS = "diffusion_pytorch_model.safetensors"

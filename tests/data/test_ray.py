@@ -10,15 +10,17 @@ from conftest import EPISODES, checksums, wait_until
 
 from acwm_core.data.generate import generate
 from acwm_core.errors import DataError
-
-pytest.importorskip("ray")
-from ray.cluster_utils import Cluster
-
-from acwm_executors.ray_cluster import RayExecutor
+from tests.extras import needs
 
 HERE = str(Path(__file__).parent)
-pytestmark = pytest.mark.ci
+pytestmark = [pytest.mark.ci, needs("ray")]
 SMALL = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+
+
+def ray_executor(address):
+    from acwm_executors.ray_cluster import RayExecutor
+
+    return RayExecutor(address=address)
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +28,8 @@ def address():
     before = os.environ.get("PYTHONPATH")
     # The workers of the nodes import the square world, and the tests by their own names.
     os.environ["PYTHONPATH"] = os.pathsep.join([HERE, str(Path(__file__).parents[2])])
+    from ray.cluster_utils import Cluster
+
     cluster = Cluster(initialize_head=True, head_node_args={**SMALL, "include_dashboard": False})
     cluster.add_node(**SMALL)
     yield cluster.address
@@ -65,13 +69,13 @@ def path_of_worker(task, report):
 
 def test_workers_import_nothing_from_the_working_folder(address, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (path,) = RayExecutor(address=address).run(path_of_worker, [0], print)
+    (path,) = ray_executor(address).run(path_of_worker, [0], print)
     assert str(tmp_path) not in path
 
 
 def test_two_nodes_share_the_tasks_and_report_them(address, tmp_path):
     units, tasks = [], [(number, tmp_path) for number in range(4)]
-    results = list(RayExecutor(address=address).run(node_of, tasks, units.append))
+    results = list(ray_executor(address).run(node_of, tasks, units.append))
     assert sorted(task for task, _ in results) == list(range(4))
     assert len({node for _, node in results}) == 2
     assert sum(units) == 8
@@ -80,7 +84,7 @@ def test_two_nodes_share_the_tasks_and_report_them(address, tmp_path):
 @pytest.mark.slow
 def test_two_nodes_make_the_same_bytes(address, square_data, tmp_path):
     out = tmp_path / "square"
-    executor = RayExecutor(address=address)
+    executor = ray_executor(address)
     generate("square", out, episodes=EPISODES, executor=executor, shard_episodes=4, progress=False)
     assert checksums(out) == checksums(square_data)
 
@@ -88,15 +92,15 @@ def test_two_nodes_make_the_same_bytes(address, square_data, tmp_path):
 @pytest.mark.slow
 def test_a_killed_worker_is_replaced(address, tmp_path):
     markers = [tmp_path / "a", tmp_path / "b"]
-    results = RayExecutor(address=address).run(die_once, markers, lambda units: None)
+    results = ray_executor(address).run(die_once, markers, lambda units: None)
     assert sorted(results) == ["a", "b"]
 
 
 def test_the_error_of_a_task_is_raised_as_it_is(address):
     with pytest.raises(DataError, match=r"^task 3 is impossible$"):
-        list(RayExecutor(address=address).run(fail, [3], lambda units: None))
+        list(ray_executor(address).run(fail, [3], lambda units: None))
 
 
 def test_no_cluster_is_one_sentence():
     with pytest.raises(DataError, match=r"no Ray cluster at 127\.0\.0\.1:9"):
-        list(RayExecutor(address="127.0.0.1:9").run(fail, [3], lambda units: None))
+        list(ray_executor("127.0.0.1:9").run(fail, [3], lambda units: None))

@@ -26,11 +26,11 @@ from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import SceneSpec, Simulator
 from acwm_play.worlds import playable
 from tests.browsing import DESK
+from tests.extras import needs
 from tests.play import follower
 
-pytestmark = pytest.mark.ci
+pytestmark = [pytest.mark.ci, needs("onnx")]
 
-pytest.importorskip("onnx", reason="needs the extra export")
 
 SIZE = (64, 64)
 

@@ -16,10 +16,10 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task, TaskEnvironment, observed
 from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog, hookimpl
+from tests.extras import needs
 from tests.tasks.playing import begin, make, solve, spec_of
 
-pytest.importorskip("mujoco")
-pytest.importorskip("taichi")
+pytestmark = needs("mujoco", "taichi")
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,10 @@ import pytest
 
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.score import estimator_for
+from tests.extras import needs
 from tests.tasks.playing import begin, like, make, seen, solve
 
-pytest.importorskip("mujoco")
-pytest.importorskip("pybullet")
-pytest.importorskip("taichi")
+pytestmark = needs("mujoco", "pybullet", "taichi")
 
 FAST = ("push_cube.place", "push_cube.place_and_turn", "reacher.reach", "robot_arm.reach")
 SLOW = (
