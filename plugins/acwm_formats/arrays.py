@@ -92,14 +92,14 @@ def write_dataset(
     options = ImportOptions(size=size, alignment=alignment or Alignment())
     is_new = not Path(out).exists()
     try:
-        made = import_dataset(recorded, out, options, workers=workers, progress=progress)
+        card = import_dataset(recorded, out, options, workers=workers, progress=progress)
     except AcwmError as error:
         if is_new and not disk_error(error):  # what was decoded before the disk was full is kept
             shutil.rmtree(out, ignore_errors=True)
         raise
     if progress:
         print(*short_form(survey(out)), sep="\n", file=sys.stderr)
-    return made
+    return card
 
 
 def _field(recording: Recording | TimedRecording, name: str, unit: str) -> StateField:

@@ -44,13 +44,13 @@ class TaskVariant(Task):
             environment.advance(act())
         return Goal.now(environment)
 
-    def distance(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def distance(self, seen: Observation, goal: Goal) -> NDArray[np.float64]:
         return self._task.distance(seen, goal)
 
-    def failed(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
         return self._task.failed(seen, goal)
 
-    def success(self, seen: Observation, goal: Goal) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def success(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
         return self._task.success(seen, goal)
 
     def solution(

@@ -36,15 +36,15 @@ class Landscape:
     """Costs over a grid of two actions.
 
     Attributes:
-        actions: place of each of the two in the action.
-        places: values along each of them, `[2, SIDE]`; means over the plan.
+        actions: index of each of the two in the action.
+        values: the grid along each of them, `[2, SIDE]`; means over the plan.
         true: the solution's values of the two.
         costs: by judge, `[SIDE, SIDE]`, of the first action down and of the second across.
         ranks: by judge, the share of the grid that is cheaper than the solution.
     """
 
     actions: tuple[int, int]
-    places: NDArray[np.float64]
+    values: NDArray[np.float64]
     true: tuple[float, float]
     costs: Mapping[str, NDArray[np.float64]]
     ranks: Mapping[str, float]
@@ -61,7 +61,7 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
         raise RecipeError(f"{player.card.name} has one action, and a landscape is one of two")
     history, true, still = _solved_so_far(player, seed)
     spec, environment = player.card.action, player.environment
-    candidates, chosen, places = _candidates(true, spec)
+    candidates, chosen, values = _candidates(true, spec)
     goal_cost = GoalCost(make_cost(player.settings), environment.task, environment.goal)
     costs: dict[str, NDArray[np.float64]] = {}
     ranks: dict[str, float] = {}
@@ -70,11 +70,11 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
         assert isinstance(controller, PlanningController)
         cost = controller.rollouts.cost(history, still, goal_cost, seed)
         with torch.no_grad():
-            values = cost(torch.from_numpy(candidates)).double().numpy()
-        costs[judge] = values[:-1].reshape(SIDE, SIDE)
-        ranks[judge] = float(np.mean(values[:-1] < values[-1]))
+            plan_costs = cost(torch.from_numpy(candidates)).double().numpy()
+        costs[judge] = plan_costs[:-1].reshape(SIDE, SIDE)
+        ranks[judge] = float(np.mean(plan_costs[:-1] < plan_costs[-1]))
     means = true.mean(0)
-    return Landscape(chosen, places, (means[chosen[0]], means[chosen[1]]), costs, ranks)
+    return Landscape(chosen, values, (means[chosen[0]], means[chosen[1]]), costs, ranks)
 
 
 def _solved_so_far(
@@ -100,15 +100,15 @@ def _candidates(
     low, high = np.array(spec.low), np.array(spec.high)
     used = np.abs(true - (low + high) / 2).mean(0) / (high - low)
     first, second = sorted(np.argsort(-used, kind="stable")[:2].tolist())
-    places = np.linspace(low[[first, second]], high[[first, second]], SIDE, axis=1)
+    values = np.linspace(low[[first, second]], high[[first, second]], SIDE, axis=1)
     plans: list[NDArray[np.float32]] = []
-    for row in places[0]:
-        for column in places[1]:
+    for row in values[0]:
+        for column in values[1]:
             moved = true.astype(np.float64)
             moved[:, second] += column - true[:, second].mean()
             moved[:, first] += row - true[:, first].mean()
             plans.append(np.clip(moved, low, high).astype(np.float32))
-    return np.stack([*plans, true]), (first, second), places
+    return np.stack([*plans, true]), (first, second), values
 
 
 def draw(shape: Landscape, spec: ActionSpec, path: Path) -> Path:
@@ -117,7 +117,7 @@ def draw(shape: Landscape, spec: ActionSpec, path: Path) -> Path:
 
     figure = Figure(figsize=(9, 4.4), layout="constrained")
     axes = figure.subplots(1, len(JUDGES), sharex=True, sharey=True)
-    rows, columns = shape.places
+    rows, columns = shape.values
     down, across = (f"{spec.names[i]} ({spec.units[i]})".removesuffix(" ()") for i in shape.actions)
     for axis, judge in zip(axes, JUDGES, strict=True):
         costs = shape.costs[judge]

@@ -93,7 +93,7 @@ def draw_curves(
     if imagined is not None and estimator is not None:
         distances = read(imagined.clip)
         for now, clip in imagined.plans:
-            frames = [now + stride * (place + 1) for place in range(len(clip))]
+            frames = [now + stride * (n + 1) for n in range(len(clip))]
             plans.append(PlannedDistances(frames, read(clip) if len(clip) else []))
     return EpisodeCurves(
         row=row,

@@ -23,16 +23,16 @@ def write_plan_page(folder: Path) -> Table:
     Returns:
         The table that it shows.
     """
-    found = PlanTable.read(folder)
-    table = plan_table(found)
+    plans = PlanTable.read(folder)
+    table = plan_table(plans)
     settings = read_json(folder / SETTINGS_FILE, dict[str, Any], "settings of results")
-    videos = {ROWS[row][0]: linked_videos(folder, row, found.task) for row in ROW_NAMES}
+    videos = {ROWS[row][0]: linked_videos(folder, row, plans.task) for row in ROW_NAMES}
     write_page(
         folder / PAGE_FILE,
         "plan.html.j2",
-        title=f"{found.task} in {found.environment}",
+        title=f"{plans.task} in {plans.environment}",
         settings=" ".join(words_of(settings)),
         table=table,
-        videos={title: shown for title, shown in videos.items() if shown},
+        videos={title: of_row for title, of_row in videos.items() if of_row},
     )
     return table

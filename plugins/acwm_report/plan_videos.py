@@ -61,39 +61,39 @@ class PlanVideo:
     @property
     def gap(self) -> str:
         """The largest error of the model in words; empty if it is not known."""
-        found, scale = self.curves.widest_gap, distance_scale(self.curves.unit)
-        if found is None:
+        widest, scale = self.curves.widest_gap, distance_scale(self.curves.unit)
+        if widest is None:
             return ""
-        frame, gap = found
+        frame, gap = widest
         return f"wrong by up to {scale.number(gap)} {scale.unit}, after {frame} actions"
 
     @property
     def drawing(self) -> CurveDrawing:
         """The curves of the video."""
-        shown, scale = self.curves, distance_scale(self.curves.unit)
-        own = [*shown.distances, *shown.imagined]
-        planned = [value for plan in shown.plans for value in plan.distances]
+        curves, scale = self.curves, distance_scale(self.curves.unit)
+        own = [*curves.distances, *curves.imagined]
+        planned = [value for plan in curves.plans for value in plan.distances]
         known = [value for value in [*own, *planned] if value is not None]
-        top, last = max([*known, 2 * shown.tolerance, 1e-9]), max(len(shown.distances) - 1, 1)
+        top, last = max([*known, 2 * curves.tolerance, 1e-9]), max(len(curves.distances) - 1, 1)
 
         def points(frames: Sequence[int], values: Sequence[float | None]) -> list[str]:
             """One curve for each stretch of known values within the episode."""
             pairs = [(f, v) for f, v in zip(frames, values, strict=False) if f <= last]
             stretches = groupby(pairs, key=lambda pair: pair[1] is not None)
             return [
-                " ".join(f"{f / last:.4f},{1 - (v or 0) / top:.4f}" for f, v in each)
-                for there, each in stretches
-                if there
+                " ".join(f"{f / last:.4f},{1 - (v or 0) / top:.4f}" for f, v in stretch)
+                for is_known, stretch in stretches
+                if is_known
             ]
 
-        frames, widest = range(len(own)), shown.widest_gap
-        plans = [points(each.frames, each.distances) for each in shown.plans]
+        frames, widest = range(len(own)), curves.widest_gap
+        plans = [points(plan.frames, plan.distances) for plan in curves.plans]
         return CurveDrawing(
             top=f"{scale.number(top)} {scale.unit}",
-            tolerance=1 - shown.tolerance / top,
-            happened=points(frames, shown.distances),
-            imagined=points(frames, shown.imagined),
-            plans=[each for curves in plans for each in curves],
+            tolerance=1 - curves.tolerance / top,
+            happened=points(frames, curves.distances),
+            imagined=points(frames, curves.imagined),
+            plans=[curve for parts in plans for curve in parts],
             widest=None if widest is None else widest[0] / last,
         )
 
@@ -154,14 +154,14 @@ def task_videos(
     experiment: Experiment | None, shown: Sequence[EvaluatedRun], room: VideoRoom
 ) -> list[tuple[str, list[PlanVideo]]]:
     """Videos of the model by task, without those that are `shown` with their runs."""
-    found: list[tuple[str, list[PlanVideo]]] = []
+    sections: list[tuple[str, list[PlanVideo]]] = []
     parents = [run.folder.resolve() for run in shown]
     for number, plan in enumerate(experiment.plans if experiment else ()):
         inside = any(plan.folder.resolve().is_relative_to(parent) for parent in parents)
         if not inside and plan.progress():
             videos = room.take(plan.folder, plan.folder, plan.task, f"task{number}")
-            found.append((plan.title, videos))
-    return [(title, videos) for title, videos in found if videos]
+            sections.append((plan.title, videos))
+    return [(title, videos) for title, videos in sections if videos]
 
 
 def _video(path: Path) -> bytes:

@@ -25,65 +25,65 @@ def rankings(run: EvaluatedRun) -> list[Ranking]:
 def rankings_of(run: Path, weights: str) -> list[Ranking]:
     """The rankings in a run folder made with weights of this SHA-256."""
     files = result_files(run, f"{RANKING_FOLDER}/*/{RANKING_FILE}")
-    found = [read_json(path, Ranking, "a ranking of policies") for path in files]
-    return [each for each in found if each.weights == weights]
+    stored = [read_json(path, Ranking, "a ranking of policies") for path in files]
+    return [ranking for ranking in stored if ranking.weights == weights]
 
 
 def ranking_tables(run: EvaluatedRun) -> list[Table]:
     """A `ranking_table` per task."""
-    return [ranking_table(found) for found in rankings(run)]
+    return [ranking_table(ranking) for ranking in rankings(run)]
 
 
-def ranking_table(found: Ranking) -> Table:
+def ranking_table(ranking: Ranking) -> Table:
     """How well policy scores agree with the simulator's, and the regret of choices."""
     columns = [Column(title, better="↑") for title in ("Pearson", "Spearman", "Kendall")]
     columns += [Column("MMRV", better="↓"), Column("Optimism")]
     rows: list[Row] = []
     for judge, (title, note) in JUDGES.items():
-        for score, by in found.agreement[judge].items():
+        for score, by in ranking.agreement[judge].items():
             cells = [Cell.of(v, PLAIN) for v in (by.pearson, by.spearman, by.kendall, by.mmrv)]
             cells.append(Cell.of(by.optimism, PLAIN, signed=True))
             score_title = "success" if score == "success" else "return"
             rows.append(Row(f"{title}, {score_title}", cells, note, strong=judge == "model"))
-    choices = found.decisions.get("model")
+    choices = ranking.decisions.get("model")
     lost = (
         ""
         if choices is None
         else (
             f"Choosing among action sequences as the model would loses "
-            f"{_text(choices.regret.value)} {found.unit} per action, at random "
+            f"{_text(choices.regret.value)} {ranking.unit} per action, at random "
             f"{_text(choices.chance.value)}, over {choices.starts} starts. "
         )
     )
-    caption = f"{lost}{_unread(found)}Returns are minus sums of distances in {found.unit}."
-    head = f"{found.task} · {len(found.policies)} policies, {found.episodes} episodes of each"
-    return Table(head, columns, rows, "Judged by", caption, f"policies-{found.task}")
+    caption = f"{lost}{_unread(ranking)}Returns are minus sums of distances in {ranking.unit}."
+    head = f"{ranking.task} · {len(ranking.policies)} policies, {ranking.episodes} episodes of each"
+    return Table(head, columns, rows, "Judged by", caption, f"policies-{ranking.task}")
 
 
 def ranking_charts(run: EvaluatedRun) -> list[Chart]:
     """Per task: the return of each policy in the model against its return in the simulator."""
     charts: list[Chart] = []
-    for found in rankings(run):
+    for ranking in rankings(run):
         true, seen = (
-            [policy.returns[judge] for policy in found.policies] for judge in ("truth", "model")
+            [policy.returns[judge] for policy in ranking.policies] for judge in ("truth", "model")
         )
         ends = [min(true + seen), max(true + seen)]
         curves = [Curve("", "muted", ends, ends, "raw"), Curve("", "model", true, seen, ".")]
         labels = "true return", "return in the model"
-        charts.append(Chart(found.task, f"{run.key}-policies-{found.task}", curves, *labels))
+        charts.append(Chart(ranking.task, f"{run.key}-policies-{ranking.task}", curves, *labels))
     return charts
 
 
-def _unread(found: Ranking) -> str:
+def _unread(ranking: Ranking) -> str:
     """A sentence on the episodes in which the estimator read no distance; empty if none."""
     pictures = {"model": "predictions", "estimator": "true pictures"}
-    counts = {judge: sum(p.unread.get(judge, 0) for p in found.policies) for judge in pictures}
-    told = [f"{count} of {pictures[judge]}" for judge, count in counts.items() if count]
-    if not told:
+    counts = {judge: sum(p.unread.get(judge, 0) for p in ranking.policies) for judge in pictures}
+    counted = [f"{count} of {pictures[judge]}" for judge, count in counts.items() if count]
+    if not counted:
         return ""
-    episodes = len(found.policies) * found.episodes
+    episodes = len(ranking.policies) * ranking.episodes
     return (
-        f"The estimator read no distance in {' and '.join(told)}, of {episodes} episodes each; "
+        f"The estimator read no distance in {' and '.join(counted)}, of {episodes} episodes each; "
         "there it counts as at the start. "
     )
 

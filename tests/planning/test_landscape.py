@@ -38,7 +38,7 @@ def test_the_solution_is_among_the_cheapest_where_the_model_is_exact(found):
     exact = found["exact"][1]
     assert exact.ranks["simulator"] < 0.1
     assert exact.ranks["model"] < 0.2
-    nearest = [abs(exact.places[k] - exact.true[k]).argmin() for k in range(2)]
+    nearest = [abs(exact.values[k] - exact.true[k]).argmin() for k in range(2)]
     least = exact.costs["simulator"].min()  # perhaps against a wall, which is as near
     assert exact.costs["simulator"][*nearest] == pytest.approx(least, abs=0.5)
 

@@ -63,7 +63,7 @@ def action_facts(
     Raises:
         DataError: none can be read.
     """
-    places = all_places({split: each.lengths for split, each in data.items()})
+    places = all_places({split: dataset.lengths for split, dataset in data.items()})
     chosen = [places[place] for place in spread(len(places), EPISODES)]
     room = max(1, ROWS // len(chosen))
     rows = [
@@ -85,7 +85,7 @@ def _some(rows: NDArray[np.float32], most: int) -> NDArray[np.float32]:
 def _facts(spec: ActionSpec, place: int, values: NDArray[np.float64]) -> ActionSummary:
     low, high = float(spec.low[place]), float(spec.high[place])
     least, most = float(values.min()), float(values.max())
-    near, far = (float(each) for each in np.quantile(values, NEARLY))
+    near, far = map(float, np.quantile(values, NEARLY))
     share = (far - near) / max(high - low, 1e-12)
     choice = len(np.unique(values[:100_000])) <= FEW
     counts, edges = np.histogram(values, BINS)

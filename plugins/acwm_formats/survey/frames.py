@@ -67,13 +67,13 @@ class FrameFacts:
         split, episode, start = place
         self.frames += len(video)
         parts = np.array_split(video, max(1, len(views)), -1)
-        found = [_defects(part, actions) for part in parts]
-        for name in found[0]:
-            marked = np.any([each[name] for each in found], axis=0)
-            setattr(self, name, getattr(self, name) + int(marked.sum()))
-            known = self.examples.setdefault(name, [])
-            room = max(0, 3 - len(known))
-            known += [(split, episode, start + int(t)) for t in np.flatnonzero(marked)[:room]]
+        defects = [_defects(part, actions) for part in parts]
+        for name in defects[0]:
+            defective = np.any([of_view[name] for of_view in defects], axis=0)
+            setattr(self, name, getattr(self, name) + int(defective.sum()))
+            examples = self.examples.setdefault(name, [])
+            room = max(0, 3 - len(examples))
+            examples += [(split, episode, start + int(t)) for t in np.flatnonzero(defective)[:room]]
 
 
 def _defects(

@@ -33,7 +33,7 @@ def motion(frames: Floats) -> Floats:
     change, between = np.diff(frames, axis=0), (frames[1:] + frames[:-1]) / 2
     down, right = np.gradient(between, axis=(2, 3))
     maps = [-(down * change).sum(1), -(right * change).sum(1), np.abs(change).sum(1)]
-    return np.stack([cell for grid in GRIDS for each in maps for cell in _cells(each, grid)], 1)
+    return np.stack([cell for grid in GRIDS for image in maps for cell in _cells(image, grid)], 1)
 
 
 def _cells(image: Floats, grid: int) -> list[Floats]:
@@ -46,10 +46,10 @@ def _cells(image: Floats, grid: int) -> list[Floats]:
 
 def poses(frames: list[Floats], count: int = 6) -> list[Floats]:
     """The first principal components of small frames, ``[T, count]`` per video: what is where."""
-    flat = [each.reshape(len(each), -1) for each in frames]
+    flat = [video.reshape(len(video), -1) for video in frames]
     whole = np.concatenate(flat)
     some = whole[np.linspace(0, len(whole) - 1, min(len(whole), 1000)).astype(int)]
     mean = some.mean(0)
     _, size, axes = np.linalg.svd(some - mean, full_matrices=False)
     scale = size[:count] / np.sqrt(len(some)) + 1e-9
-    return [((each - mean) @ axes[:count].T / scale).astype(np.float32) for each in flat]
+    return [((rows - mean) @ axes[:count].T / scale).astype(np.float32) for rows in flat]

@@ -44,28 +44,28 @@ def near_duplicates(
 
     def prints(split: Split) -> Iterator[tuple[int, _Print]]:
         for index in spread(len(data[split]), EPISODES):
-            made = unread.read(split, index, lambda i=index: _print(data[split], i))
-            yield from ((index, each) for each in made)
+            for fingerprint in unread.read(split, index, lambda i=index: _print(data[split], i)):
+                yield index, fingerprint
 
-    known = dict(prints("train"))
-    if not known:
+    train = dict(prints("train"))
+    if not train:
         return [], 0
-    frames = np.stack([each.frames for each in known.values()])
-    actions = np.stack([each.actions for each in known.values()])
+    frames = np.stack([fingerprint.frames for fingerprint in train.values()])
+    actions = np.stack([fingerprint.actions for fingerprint in train.values()])
     scale = actions.reshape(-1, actions.shape[-1]).std(0) + 1e-9
-    found: list[NearDuplicate] = []
+    duplicates: list[NearDuplicate] = []
     count = 0
-    tests: list[Split] = [each for each in data if each != "train"]
+    tests: list[Split] = [split for split in data if split != "train"]
     for split in tests:
-        for index, seen in prints(split):
+        for index, fingerprint in prints(split):
             count += 1
-            apart = np.abs(actions - seen.actions).max(1) / scale
+            apart = np.abs(actions - fingerprint.actions).max(1) / scale
             for place in np.flatnonzero((apart <= ALIKE).all(-1)):
-                gap = np.abs(frames[place].astype(np.int16) - seen.frames).max()
+                gap = np.abs(frames[place].astype(np.int16) - fingerprint.frames).max()
                 if gap <= NEAR * 255:
-                    found.append(NearDuplicate(split, index, list(known)[int(place)]))
+                    duplicates.append(NearDuplicate(split, index, list(train)[int(place)]))
                     break
-    return found, count
+    return duplicates, count
 
 
 def _print(data: EpisodeDataset, index: int) -> _Print:

@@ -21,7 +21,7 @@ def standard(rows: Rows) -> list[Numbers]:
     """Columns of zero mean and unit variance; numbers far out are cut."""
     every = np.concatenate(rows)
     mean, size = every.mean(0), every.std(0) + 1e-9
-    return [np.clip((each - mean) / size, -LIMIT, LIMIT) for each in rows]
+    return [np.clip((part - mean) / size, -LIMIT, LIMIT) for part in rows]
 
 
 def fitted(inputs: Rows, targets: Rows, groups: NDArray[np.int64]) -> list[Numbers]:
@@ -47,7 +47,7 @@ def fitted(inputs: Rows, targets: Rows, groups: NDArray[np.int64]) -> list[Numbe
 
 
 def residuals(inputs: Rows, targets: Rows, groups: NDArray[np.int64]) -> list[Numbers]:
-    """What `inputs` do not tell of `targets`."""
+    """What `inputs` do not predict of `targets`."""
     weights = fitted(inputs, targets, groups)
     return [y - x @ w for x, y, w in zip(inputs, targets, weights, strict=True)]
 
@@ -59,16 +59,16 @@ def gains(
     groups: NDArray[np.int64],
     others: Sequence[Sequence[int]],
 ) -> Numbers:
-    """The share of the targets' variance that a stretch's own inputs tell, ``[target, group]``.
+    """The share of the targets' variance that a stretch's own inputs explain, ``[target, group]``.
 
-    `known` is told besides. The share is half the difference to the error with the inputs of
+    `known` is given besides. The share is half the difference to the error with the inputs of
     `others`, indices of other stretches for each, so it is zero on average if inputs and targets
     only have their time in common.
     """
     both = [np.concatenate(pair, 1) for pair in zip(known, inputs, strict=True)]
     weights = fitted(both, targets, groups)
     size, split = np.concatenate(targets).var(0) + 1e-12, known[0].shape[1]
-    found: list[Numbers] = []
+    parts: list[Numbers] = []
     for index, (y, w) in enumerate(zip(targets, weights, strict=True)):
         left, gain = y - known[index] @ w[:split], np.zeros(y.shape[1])
         own = (left - inputs[index] @ w[split:]) ** 2
@@ -76,8 +76,8 @@ def gains(
             n = min(len(left), len(inputs[other]))
             wrong = (left[:n] - inputs[other][:n] @ w[split:]) ** 2
             gain += (wrong - own[:n]).mean(0) / (2 * size * len(others[index]))
-        found.append(gain)
-    gathered = np.stack(found, 1)
+        parts.append(gain)
+    gathered = np.stack(parts, 1)
     return np.stack([gathered[:, groups == g].mean(1) for g in range(int(groups.max()) + 1)], 1)
 
 

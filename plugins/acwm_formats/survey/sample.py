@@ -43,7 +43,7 @@ class Stretch:
 
 @dataclass
 class Unread:
-    """Episodes that cannot be read: they are left out, and told.
+    """Episodes that cannot be read: they are left out, and reported.
 
     Attributes:
         places: split and index of each, and why.
@@ -70,12 +70,12 @@ def spread(count: int, most: int) -> list[int]:
 
 def all_places(lengths: Mapping[Split, list[int]]) -> list[tuple[Split, int]]:
     """Split and index of every episode."""
-    return [(split, index) for split, each in lengths.items() for index in range(len(each))]
+    return [(split, index) for split, part in lengths.items() for index in range(len(part))]
 
 
 def stretches(data: Mapping[Split, EpisodeDataset], unread: Unread) -> Iterator[Stretch]:
     """Read stretches one by one, so that one is in memory at a time."""
-    places = all_places({split: each.lengths for split, each in data.items()})
+    places = all_places({split: dataset.lengths for split, dataset in data.items()})
     height, width = next(iter(data.values())).card.environment.frame_size
     most = int(np.clip(PIXELS / (LENGTH * height * width), LEAST, MOST))
     chosen = spread(len(places), most)

@@ -121,28 +121,28 @@ class ModelJudge(Judge):
         """All sequences get the same noise, so they differ only in actions."""
         outcomes: list[Outcome] = []
         for first in range(0, len(actions), self.batch):
-            outcomes += self._replay_batch(start, np.stack(actions[first : first + self.batch]))
+            batch = np.stack(actions[first : first + self.batch])
+            outcomes += self._replay_batch(start, torch.from_numpy(batch))
         return outcomes
 
-    def _replay_batch(self, start: Start, rows: NDArray[np.float32]) -> list[Outcome]:
-        number, known = len(rows), len(start.history.frames)
-        last = np.zeros_like(rows[:, :1])  # no frame follows it
-        frames, actions = self._given(start)
-        between = actions.expand(number, -1, -1).numpy()
-        inputs = torch.from_numpy(np.concatenate([between, rows, last], 1)).to(self._device)
+    def _replay_batch(self, start: Start, actions: Tensor) -> list[Outcome]:
+        number, context = len(actions), len(start.history.frames)
+        last = torch.zeros_like(actions[:, :1])  # no frame follows it
+        frames, between = self._given(start)
+        inputs = torch.cat([between.expand(number, -1, -1), actions, last], 1).to(self._device)
         given = frames.expand(number, -1, -1, -1, -1)
         seeds = [start.history.spec.index] * number
         observations = list[list[Observation]]()
         with noting(_when(start), *self._world.children()):
             chunks = self._world.rollout_chunks(given, inputs, steps=self._steps, seeds=seeds)
             for chunk in chunks:
-                new = chunk[:, max(0, known) :]
-                known = max(0, known - chunk.shape[1])
-                if new.shape[1]:
-                    observations.append([self._estimator.read(each.cpu()) for each in new])
+                predicted = chunk[:, context:]
+                context = max(0, context - chunk.shape[1])
+                if predicted.shape[1]:
+                    observations.append([self._estimator.read(clip.cpu()) for clip in predicted])
         return [
-            read_outcome(join_observations([*seen]), self._task, start)
-            for seen in zip(*observations, strict=True)
+            read_outcome(join_observations([*parts]), self._task, start)
+            for parts in zip(*observations, strict=True)
         ]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
@@ -159,9 +159,9 @@ class ModelJudge(Judge):
                 frames = stream.step(rows)[0]
             frame = frames[-1]
             observations.append(self._estimator.read(frames.cpu()))
-        seen = join_observations(observations)
-        states = {name: values[:steps] for name, values in seen.states.items()}
-        return read_outcome(Observation(seen.masks[:steps], states), self._task, start)
+        whole = join_observations(observations)
+        states = {name: values[:steps] for name, values in whole.states.items()}
+        return read_outcome(Observation(whole.masks[:steps], states), self._task, start)
 
     @property
     def _device(self) -> torch.device:

@@ -92,8 +92,8 @@ class OwnPolicy:
         """The next action for a frame, of which an estimator reads the states if it needs them."""
         state = None
         if self.observes == "state" and estimator is not None:
-            seen = estimator.read(as_clip(frame[None]))
-            state = {name: values[0] for name, values in seen.states.items()}
+            observation = estimator.read(as_clip(frame[None]))
+            state = {name: values[0] for name, values in observation.states.items()}
         return self.act(frame.copy(), state)  # the policy may modify the frame
 
     def _call(self, doing: str, function: Any, *arguments: Any) -> Any:

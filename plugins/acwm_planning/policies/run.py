@@ -138,7 +138,7 @@ class Ranker(EpisodeTable):
         """The script's own actions and their alternatives, `[T, A]` each."""
         card = self._environment.environment.card
         other = first_start(self._simulator, card, range(seed + 1, seed + 1 + TRIED_SEEDS))
-        episodes = [self._play(place, self._script) for place in (other, start)]
+        episodes = [self._play(begin, self._script) for begin in (other, start)]
         another, own = (np.pad(episode.actions, ((0, 1), (0, 0))) for episode in episodes)
         self._simulator.start(start.history.spec, start.goal)
         inner = self._environment.environment
