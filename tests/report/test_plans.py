@@ -19,6 +19,7 @@ from acwm_planning.table import summarise
 from acwm_report.comparison import compare_runs
 from acwm_report.leaderboard import write_leaderboard
 from acwm_report.page import export_report, write_report
+from acwm_report.plan_page import write_plan_page
 from acwm_report.plan_videos import PlanVideo, VideoRoom, plan_videos
 from acwm_report.plans import plan_tables
 from acwm_report.run import EvaluatedRun
@@ -108,6 +109,18 @@ def test_curves_are_those_of_the_file(planned):
     ]  # no further than the end
     assert drawn.widest == 1.0
     assert curves.widest_gap == (3, pytest.approx(0.25))
+
+
+def test_the_page_of_a_plan_links_to_the_videos_that_can_be_read(planned):
+    folder = planned / "planning" / "place"
+    write_json(folder / "settings.json", {"past": 1})
+    (folder / "videos" / "still-0001.json").write_text("{")
+    with pytest.warns(AcwmWarning, match="still-0001.json is not curves of a video"):
+        write_plan_page(folder)
+    page = (folder / "index.html").read_text()
+    assert page.count("<video") == page.count('src="videos/model-0001.mp4"') == 1
+    assert "past=1" in page
+    assert "&lt;place&gt; in drift" in page
 
 
 def test_plans_of_other_weights_are_not_shown(tmp_path):
