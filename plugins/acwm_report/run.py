@@ -12,6 +12,7 @@ from jinja2 import TemplateError
 
 from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.evaluation.results import Estimate, MetricInfo, Score, SetSummary, Summary
+from acwm_core.evaluation.statistics import MIN_EPISODES
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.files import inside
 from acwm_core.plugins import catalog
@@ -85,9 +86,24 @@ class EvaluatedRun:
             return "The prediction beats a still picture, but is action-insensitive."
         return "The prediction is no better than a still picture, and action-insensitive."
 
+    @property
+    def too_few(self) -> str:
+        """Which splits have no intervals, and why; empty if all may have."""
+        return too_few(self.summary)
+
     def metrics(self, reads: str) -> list[str]:
         """Names of the metrics that read ``"pixels"``, or those that read ``"states"``."""
         return [name for name, info in self.summary.metrics.items() if info.reads == reads]
+
+
+def too_few(summary: Summary) -> str:
+    """Which splits have no intervals, as they have too few episodes; empty if all have enough."""
+    few = [
+        f"{split} has {result.scores.episodes}"
+        for split, result in summary.splits.items()
+        if result.scores.episodes < MIN_EPISODES
+    ]
+    return f"which takes {MIN_EPISODES} of them: {', '.join(few)}" if few else ""
 
 
 DAMAGE = (

@@ -47,9 +47,9 @@ def print_summary(summary: Summary) -> None:
         _print_remarks(result.scores, summary.handed_in)
         if phrase := draws_phrase(summary, split):
             click.echo(f"{split}: {phrase}")
-    others = "; `other actions`: the model was given another episode's actions"
-    told = any("shuffled" in result.scores.rows for result in summary.splits.values())
-    click.echo(f"± is half the 95 % confidence interval over episodes{others * told}")
+    click.echo(_about_intervals(summary))
+    if any("shuffled" in result.scores.rows for result in summary.splits.values()):
+        click.echo("`other actions`: the model was given another episode's actions")
     if any(r.scores.shares.get("model") for r in summary.splits.values()):
         click.echo(
             "scored: share of the bodies and frames in which the model shows what is measured"
@@ -61,6 +61,14 @@ def print_summary(summary: Summary) -> None:
     if summary.published:
         console.print(_published_table(summary, summary.published.row))
         click.echo(about_published(summary))
+
+
+def _about_intervals(summary: Summary) -> str:
+    """What ± means, and why splits have none."""
+    from acwm_report.run import too_few
+
+    few = too_few(summary)
+    return f"± is half the 95 % confidence interval over episodes{f', {few}' if few else ''}"
 
 
 def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
@@ -102,13 +110,15 @@ def print_severity(curve: SeverityCurve) -> None:
 
 
 def _text(estimate: Estimate, *, interval: bool = True) -> str:
-    """``24.41 ±0.5``: four digits (two if below 0.01), and half the interval if there is one."""
+    """``24.41 ±0.5``: four digits (two if below 0.01), and half the interval, ``±–`` if none."""
     if estimate.value is None:
         return "–"
     digits = 4 if abs(estimate.value) >= 0.01 else 2  # small values have enough zeros
     text = f"{estimate.value:#.{digits}g}".replace("inf", "∞")
     if interval and estimate.low is not None and estimate.high is not None:
         text += f" ±{(estimate.high - estimate.low) / 2:.1g}"
+    elif interval and math.isfinite(estimate.value):
+        text += " ±–"
     return text
 
 

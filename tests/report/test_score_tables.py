@@ -11,9 +11,11 @@ from acwm_core.evaluation.protocol import published_for
 from acwm_core.evaluation.statistics import Estimate
 from acwm_core.plugins import Catalog
 from acwm_report import run as runs
+from acwm_report.page import write_report
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.scores import ScoreGrid, main_table
 from acwm_report.tables import score_tables, state_tables
+from acwm_report.terminal import print_summary
 from tests.report import synthetic
 
 SCORES = np.linspace(20, 26, 6)
@@ -100,3 +102,15 @@ def test_a_foreign_metric_of_pixels_stands_among_those_of_pixels(tmp_path, monke
         assert ("Acuity", "lp/px", "↑") in heads
         assert [column.key for column in main_table([found]).columns][-1] == "ind_test_acuity"
         assert [row.title for row in states.rows] == ["ODD"]
+
+
+@pytest.mark.parametrize(("count", "few"), [(4, True), (6, False)])
+def test_a_split_without_intervals_says_why(tmp_path, capsys, count, few):
+    folder = synthetic.run(tmp_path / "it", synthetic.clips(SCORES[:count]), environment="reacher")
+    read = EvaluatedRun.read(folder, "run1")
+    print_summary(read.summary)
+    said = capsys.readouterr().out
+    why = "which takes 5 of them: ind_test has 4"
+    assert ("±–" in said) == (why in said) == few
+    page = write_report([folder], tmp_path / "page.html").read_text()
+    assert (why in page) == few
