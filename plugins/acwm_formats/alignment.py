@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 
 from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
-from acwm_formats.cadence import SAME, Cadence, cadence, faults
+from acwm_formats.cadence import JITTER, SAME, Cadence, cadence, faults
 from acwm_formats.timeline import Frames, Samples, TimedRecording
 
 OnDefect = Literal["refuse", "skip", "trim"]
+
+LOST = 0.2  # share of regular actions that may be missing; with more, their rhythm is another
+UNUSED = 0.01  # share of the actions that may be at no frame without a word: clocks differ
 
 TRIM, GAP = "--on-defect trim", "--max-gap or --on-defect trim"
 
@@ -90,6 +93,8 @@ class Aligned:
         episodes: what becomes of it: one episode, or several sound parts, or none.
         defects: what is wrong with it; `episodes` are its sound parts then.
         notes: what was filled or left out, for people; `name` says of which recording.
+        per_frame: actions per frame of the episodes; 1 if every frame takes one of its own.
+        unused: share of the actions that are at no frame, as others come before the next frame.
         rate: measured frames per second of its frames; 0 if unknown.
         seconds: how long they were measured.
     """
@@ -98,6 +103,8 @@ class Aligned:
     episodes: list[PlannedEpisode] = field(default_factory=list[PlannedEpisode])
     defects: list[Defect] = field(default_factory=list[Defect])
     notes: list[str] = field(default_factory=list[str])
+    per_frame: float = 1.0
+    unused: float = 0.0
     rate: float = 0.0
     seconds: float = 0.0
 
@@ -133,7 +140,7 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
         cameras: those to show; the first one gives the moments.
         options: how.
     """
-    found = Aligned(recording.name)
+    found = Aligned(recording.name, notes=[*recording.notes])
     try:
         frames = {name: _frame_stream(found, name, recording.cameras[name]) for name in cameras}
         main = frames[cameras[0]]
@@ -211,6 +218,11 @@ class _Rows:
     def stream(self, name: str, samples: Samples, *, last: bool = True) -> _Stream:
         """The samples of `name` as a stream; without `last`, the last frame needs no row."""
         values = _numbers(name, samples.values)
+        if not last and samples.times is None and len(values) > 1:
+            kept = slice(None if _finite(values[-1:]).all() else -1)  # it leads to no frame
+            frames = None if samples.frames is None else samples.frames[kept]
+            values = values[kept]
+            samples = Samples(values, frames=frames)
         if not len(values):
             raise DataError(f"{name} has 0 rows")
         if samples.times is not None:
@@ -220,7 +232,7 @@ class _Rows:
         else:
             times, values = self._placed(name, samples, values, last)
         stream = _sound(self._found, name, _Stream(times, values))
-        finite = np.isfinite(stream.values.reshape(len(stream.values), -1).astype(np.float64))
+        finite = _finite(stream.values)
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
             self._found.found(f"{name} is not finite in row {row}, dimension {column}")
@@ -254,6 +266,10 @@ class _Rows:
                 return places
         self._found.found(f"{name} has {count} rows, and the video {len(self._frames)} frames")
         return self._slots[self._late :]
+
+
+def _finite(values: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.isfinite(values.reshape(len(values), -1).astype(np.float64))
 
 
 def _rows_of(actions: Samples) -> Samples:
@@ -363,17 +379,24 @@ def _acted(
     """The action from each moment to the next, and whether there is one."""
     taken, known = _held(found, "action", actions, grid, options)
     taken = taken.astype(np.float64)
+    found.per_frame, found.unused = _per_frame(actions, grid, options.tolerance)
     step = actions.step or grid.step
-    if abs(step / grid.step - 1) > SAME + options.tolerance / len(grid.times):
+    differs = abs(step / grid.step - 1) > SAME + options.tolerance / len(grid.times)
+    if found.unused or differs:
         kinds = options.kinds or ("absolute",)
         kinds = kinds * (taken.shape[1] if len(kinds) == 1 else 1)
         if len(kinds) != taken.shape[1]:
             raise DataError(f"its actions have {taken.shape[1]} dimensions, not {len(kinds)}")
-        sums = _summed(actions, grid)
         rates = np.array([kind in ("velocity", "torque") for kind in kinds])
         deltas = np.array([kind == "delta" for kind in kinds])
-        taken[:, rates] = sums[:, rates] / grid.step
-        taken[:, deltas] = sums[:, deltas] / step
+        ends = np.append(actions.times, actions.times[-1] + step)
+        values = actions.values.astype(np.float64)
+        seconds = np.diff(ends)[:, None]
+        taken[:, rates] = _summed(values[:, rates] * seconds, ends, grid) / grid.step
+        taken[:, deltas] = _summed(values[:, deltas] * _counts(actions), ends, grid)
+        if rates.any() or deltas.any():  # a sum needs the whole interval
+            slack = options.tolerance * grid.step
+            known &= grid.times + grid.step <= ends[-1] + slack
     if options.shift:
         taken, known = np.roll(taken, options.shift, axis=0), np.roll(known, options.shift)
         known[: max(options.shift, 0)] = False
@@ -381,13 +404,39 @@ def _acted(
     return taken, known
 
 
-def _summed(actions: _Stream, grid: _Grid) -> NDArray[np.float64]:
-    """The integral of the actions, each held until the next, over each interval of the grid."""
-    values = actions.values.astype(np.float64)
-    ends = np.append(actions.times, actions.times[-1] + actions.step)
-    total = np.concatenate(
-        [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)]
-    )
+def _per_frame(actions: _Stream, grid: _Grid, tolerance: float) -> tuple[float, float]:
+    """Actions per moment of the grid, and the share that is at none of them.
+
+    They are 1 and 0 if, but for the error of clocks, each moment has its own.
+    """
+    step = actions.step or grid.step
+    slack = tolerance * min(grid.step, step)
+    edges = np.append(grid.times, grid.times[-1] + grid.step) - slack
+    counts = np.histogram(actions.times, edges)[0]
+    first, last = np.searchsorted(edges, actions.times[[0, -1]], side="right") - 1
+    counts = counts[max(first, 0) : max(last, 0)]  # not where actions begin or end
+    unused = int(np.maximum(counts - 1, 0).sum())
+    if unused > max(1, UNUSED * counts.sum()):
+        return float(counts.mean()), unused / float(counts.sum())
+    empty = int((counts == 0).sum())
+    slow = step / grid.step > 1 + SAME + tolerance / len(grid.times)
+    return (grid.step / step if slow and empty > 1 else 1.0), 0.0
+
+
+def _counts(actions: _Stream) -> NDArray[np.float64]:
+    """How many actions each sample stands for ``[N, 1]``: more than one if the next were lost."""
+    steps = np.diff(actions.times) / (actions.step or 1.0)
+    places = np.rint(steps)
+    regular = len(steps) and np.abs(steps - places).max() <= JITTER
+    few = places.sum() <= (1 + LOST) * len(places)
+    return np.append(places if regular and few else np.ones(len(steps)), 1.0)[:, None]
+
+
+def _summed(
+    values: NDArray[np.float64], ends: NDArray[np.float64], grid: _Grid
+) -> NDArray[np.float64]:
+    """Sums over each interval of the grid of values that are spread evenly until the next one."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     edges = np.append(grid.times, grid.times[-1] + grid.step)
-    at = np.stack([np.interp(edges, ends, column) for column in total.T], axis=1)
-    return np.diff(at, axis=0)
+    at = [np.interp(edges, ends, column) for column in total.T]
+    return np.diff(np.array(at).reshape(len(at), len(edges)), axis=1).T

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import av
 import numpy as np
@@ -18,6 +18,7 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
+from acwm_formats.channels import STACKED, Channels, channels_of, coloured
 from acwm_formats.images import channels_last, guessed_range, is_depth, read_image, to_rgb
 from acwm_formats.sources import present
 
@@ -258,6 +259,7 @@ class ImageFrames:
         pixel_range: the values that are black and white, see `to_rgb`; guessed from the first image
             by default.
         unit: metres per whole number, if they are depth maps; floating-point ones are in metres.
+        channels: what three or four channels of arrays are; found out by default.
         stamp: as in `Frames`.
     """
 
@@ -265,6 +267,7 @@ class ImageFrames:
     times: NDArray[np.float64]
     pixel_range: tuple[float, float] | None = None
     unit: float = MILLIMETRE
+    channels: Channels | None = None
     stamp: str = ""
 
     @functools.cached_property
@@ -272,6 +275,22 @@ class ImageFrames:
         if not len(self.images):
             raise DataError("it holds no frame")
         return _image(self.images[0])
+
+    @functools.cached_property
+    def shown(self) -> Channels | None:
+        """What the channels are; None if they are grey, depth, or those that a file of one names.
+
+        Raises:
+            DataError: it cannot be told.
+        """
+        count = channels_last(self._first).shape[2]
+        if isinstance(self.images[0], str | Path | bytes) or count == 1:
+            return None
+        if self.channels is None:
+            return channels_of(cast(Sequence[Any], self.images), np.asarray)
+        if self.channels == ("rgba" if count == 3 else "rgb"):
+            raise DataError(f"its frames have {count} channels, not {self.channels}")
+        return self.channels
 
     @property
     def size(self) -> tuple[int, int]:
@@ -289,8 +308,10 @@ class ImageFrames:
     ) -> Iterator[NDArray[np.uint8]]:
         """As in `Frames`."""
         pixel_range = self.pixel_range or guessed_range(self._first)
+        channels = self.shown
         for index in indices:
             image = _image(self.images[index])
+            image = image if channels is None else coloured(image, channels)
             if self.depth and image.dtype.kind != "f":
                 image = image.astype(np.float32) * self.unit
             yield to_rgb(image, depth_range=depth_range, pixel_range=pixel_range)
@@ -305,3 +326,19 @@ def _image(image: Any) -> NDArray[Any]:
 def regular_times(count: int, rate: float | Fraction) -> NDArray[np.float64]:
     """Times of `count` frames at a constant rate, from 0."""
     return np.arange(count) / float(rate) if math.isfinite(rate) else np.zeros(count)
+
+
+def stack_note(frames: Iterable[object]) -> list[str]:
+    """A sentence for people if some frames are stacks of moments, of which one is shown.
+
+    Raises:
+        DataError: frames cannot be read.
+    """
+    stacks = {
+        STACKED.format(
+            channels=each.shown, count=channels_last(np.asarray(each.images[0])).shape[2]
+        )
+        for each in frames
+        if isinstance(each, ImageFrames) and each.shown in ("newest-last", "newest-first")
+    }
+    return sorted(stacks)

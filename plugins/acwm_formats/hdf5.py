@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -18,18 +19,28 @@ from acwm_core.env.card import EnvironmentCard
 from acwm_core.env.episode import SPLITS, Episode, Split
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
+from acwm_formats.channels import Channels
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
+from acwm_formats.frames import stack_note
 from acwm_formats.hdf5_layouts import (
     Layout,
+    array,
+    bounds_in,
     episodes_in,
     files_of,
     layout_of,
     opened,
 )
-from acwm_formats.hdf5_recordings import HDF5Recordings
-from acwm_formats.names import exact, pair, typed, word, words
-from acwm_formats.timeline import ActionFacts, RecordedDataset, Recordings, first_sound
+from acwm_formats.hdf5_recordings import HDF5Recordings, Place
+from acwm_formats.names import exact, is_action, pair, text_note, typed, word, words
+from acwm_formats.timeline import (
+    ActionFacts,
+    RecordedDataset,
+    Recordings,
+    TimedRecording,
+    first_sound,
+)
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
@@ -55,12 +66,14 @@ class HDF5(Format):
         states: str | None = None,
         rate: float | None = None,
         pixel_range: tuple[int, ...] | None = None,
+        channels: Channels | None = None,
     ) -> RecordedDataset:
         """Import an HDF5 file, or a folder of them.
 
-        Layouts of robomimic, LIBERO, ACT/ALOHA and acwm are known. For any other, say where in the
-        group of an episode its frames and actions lie, e.g. --video obs/front --actions actions;
-        every group that has both is an episode.
+        Layouts of robomimic, LIBERO, ACT/ALOHA, stable-worldmodel and acwm are known. For any
+        other, say where in the group of an episode its frames and actions lie, e.g. --video
+        obs/front --actions actions; every group that has both is an episode, or several in a row
+        where an array such as ep_len or episode_index says so.
 
         Args:
             root: the file or folder.
@@ -69,6 +82,7 @@ class HDF5(Format):
             states: Paths of the states to keep, with commas between.
             rate: Frames per second, if the files do not say it.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
+            channels: What four channels are (rgba), or which of stacked grey frames is the newest.
         """
         root = Path(root)
         files = files_of(root)
@@ -80,20 +94,26 @@ class HDF5(Format):
             raise DataError(f"{first} does not say how many frames it has per second: give --rate")
         stated = exact(rate) if rate else cast(Fraction, layout.rate)
         reader = functools.partial(
-            HDF5Recordings, layout=layout, rate=stated, pixel_range=pair(pixel_range)
+            HDF5Recordings,
+            layout=layout,
+            rate=stated,
+            pixel_range=pair(pixel_range),
+            channels=channels,
         )
         options = {"video": video, "actions": actions, "states": states, "rate": rate}
+        options["channels"] = channels
         card = _card(first) if layout.name == "acwm" else None
+        splits = _splits(files, layout, reader)
         return RecordedDataset(
             name=card.name if card else word(root),
-            splits=_splits(files, layout, reader),
+            splits=splits,
             facts={"kind": "hdf5", "name": root.resolve().name, "layout": layout.name}
             | {"bytes": sum(path.stat().st_size for path in files), "files": len(files)},
             options=options | {"pixel_range": typed(pixel_range)},
             actions=_action(card, layout),
             state=card.state if card and states is None else None,
             instances=_instances(card),
-            notes=(layout.note,) if layout.note and not rate else (),
+            notes=_notes(first, layout, splits, stated=rate is not None),
             summary=card.summary if card else f"Recorded in the layout of {layout.name}",
         )
 
@@ -144,8 +164,10 @@ def _layout(path: Path, video: str | None, actions: str | None, states: str | No
     told = Layout("its owner", _paths(video), (actions or "").strip("/"), _paths(states))
     if known is None:
         return told
+    kind = known.kind if told.actions in ("", known.actions) else None
     return replace(
         known,
+        kind="absolute" if kind is None and "abs" in told.actions.split("_") else kind,
         cameras=told.cameras or known.cameras,
         actions=told.actions or known.actions,
         states=known.states if states is None else told.states,
@@ -160,21 +182,22 @@ def _paths(text: str | None) -> dict[str, str]:
 def _splits(
     files: Sequence[Path],
     layout: Layout,
-    reader: Callable[[dict[int, tuple[Path, str]]], Recordings],
+    reader: Callable[[dict[int, Place]], Recordings],
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
-    found: dict[Split | None, list[tuple[Path, str]]] = {}
-    damaged: list[tuple[Path, str]] = []
+    found: dict[Split | None, list[Place]] = {}
+    damaged: list[Place] = []
     for path in files:
         try:
-            names, tests = _contents(path, layout)
+            places, tests = _contents(path, layout)
         except DataError:
-            damaged.append((path, "/"))  # opening it will tell why
+            damaged.append(Place(path, "/"))  # opening it will tell why
             continue
         own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
-        for name in names:
-            split = cast(Split | None, own or (tests and tests.get(name.split("/")[-1], "train")))
-            found.setdefault(split, []).append((path, name))
+        for place in places:
+            name = place.group.split("/")[-1]
+            split = cast(Split | None, own or (tests and tests.get(name, "train")))
+            found.setdefault(split, []).append(place)
     if damaged and found:
         found.setdefault(None if None in found else "train", []).extend(damaged)
     if not found:
@@ -185,10 +208,51 @@ def _splits(
     return {split: reader(dict(enumerate(places))) for split, places in found.items() if split}
 
 
-def _contents(path: Path, layout: Layout) -> tuple[list[str], dict[str, Split] | None]:
-    """The groups of episodes in a file, and those that it sets aside for tests."""
+def _contents(path: Path, layout: Layout) -> tuple[list[Place], dict[str, Split] | None]:
+    """The episodes in a file, and the groups of those that it sets aside for tests."""
     with opened(path) as file:
-        return episodes_in(file, layout), _tests(file)
+        names = episodes_in(file, layout)
+        places = [place for name in names for place in _places(path, file, name, names, layout)]
+        return places, _tests(file)
+
+
+def _places(
+    path: Path, file: Any, name: str, names: Sequence[str], layout: Layout
+) -> Iterator[Place]:
+    """The episodes in a group: one, or several in a row."""
+    bounds = None
+    if layout.name != "acwm" and not (layout.is_robosuite and layout.actions == "actions"):
+        count = len(array(file[name], layout.actions))
+        bounds = bounds_in(file[name], count, alone=len(names) == 1)
+        for where in (*layout.cameras.values(), *layout.states.values()) if bounds else ():
+            if (other := len(array(file[name], where))) != count:
+                raise DataError(f"{where} of {path} has {other} rows, and the actions have {count}")
+    if bounds is None:
+        yield Place(path, name)
+    for number, (start, stop) in enumerate(bounds or ()):
+        yield Place(path, name, number, start, stop)
+
+
+def _notes(
+    path: Path, layout: Layout, splits: Recordings | Mapping[Split, Recordings], *, stated: bool
+) -> tuple[str, ...]:
+    """What people should know about how the files were read."""
+    notes = [layout.note] if layout.note and not stated else []
+    with opened(path) as file:
+        if names := episodes_in(file, layout):
+            group = file[names[0]]
+            others = [n for n in group if is_action(n) and n != layout.actions]
+            used = {*layout.states.values(), *layout.cameras.values()}
+            if left := sorted({*others} - used):
+                notes.append(
+                    f"Actions are {layout.actions}; left out: {', '.join(left)} (--actions NAME)."
+                )
+    first = next(iter(splits.values())) if isinstance(splits, Mapping) else splits
+    with contextlib.suppress(DataError, OSError, LookupError):
+        recording = cast(TimedRecording, first[0])
+        notes += stack_note(recording.cameras.values())
+        notes += text_note(recording.facts) if layout.name != "acwm" else []
+    return tuple(notes)
 
 
 def _closed(path: Path) -> None:
@@ -205,7 +269,7 @@ def _tests(file: Any) -> dict[str, Split] | None:
 
 def _action(card: EnvironmentCard | None, layout: Layout) -> ActionFacts:
     if card is None:
-        return ActionFacts(kind=layout.kind)
+        return ActionFacts(kind=layout.kind, held=layout.held, ask=layout.is_robosuite)
     spec = card.action
     return ActionFacts(spec.names, spec.units, spec.kind, (spec.low, spec.high))
 

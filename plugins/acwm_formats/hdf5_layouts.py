@@ -1,4 +1,4 @@
-"""HDF5 files of robomimic, LIBERO, ACT/ALOHA and acwm, and of any other layout that is told."""
+"""HDF5 of robomimic, LIBERO, ACT/ALOHA, stable-worldmodel, acwm, and any other layout."""
 
 from __future__ import annotations
 
@@ -13,8 +13,18 @@ import h5py
 
 from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
+from acwm_formats.episode_bounds import (
+    FIRST,
+    LAST,
+    NUMBERS,
+    Bounds,
+    bounds_of,
+    divides,
+    plain,
+)
 from acwm_formats.images import CHANNELS
 from acwm_formats.names import natural
+from acwm_formats.robosuite import robosuite
 
 ENDINGS = (".hdf5", ".h5")
 ALOHA_RATE = Fraction(50)  # the layout does not say it; all of its recorders have a step of 20 ms
@@ -30,8 +40,9 @@ class Layout:
         actions: path of the actions.
         states: path of each state by its name.
         rate: frames per second; None if the files do not say it.
-        kind: what actions command.
+        kind: what actions command; None if the files do not say it.
         note: a sentence for people.
+        held: dimensions of the actions that are absolute in every case, such as a gripper's.
     """
 
     name: str
@@ -39,8 +50,14 @@ class Layout:
     actions: str
     states: Mapping[str, str] = field(default_factory=dict[str, str])
     rate: Fraction | None = None
-    kind: ActionKind = "absolute"
+    kind: ActionKind | None = None
     note: str = ""
+    held: tuple[int, ...] = ()
+
+    @property
+    def is_robosuite(self) -> bool:
+        """Whether its actions are a robosuite controller's, most of which take steps."""
+        return self.name in ("robomimic", "LIBERO")
 
 
 def files_of(path: Path) -> list[Path]:
@@ -112,11 +129,13 @@ def layout_of(file: Any) -> Layout | None:
     """The layout of a file, if it is one that is known."""
     if file.attrs.get("format") == "acwm":
         return _ours(file)
-    if "data" in file and isinstance(file["data"], h5py.Group) and len(file["data"]):
-        return _robomimic(file["data"])
+    data = file.get("data")
+    if isinstance(data, h5py.Group) and len(data) and (found := _robomimic(data)):
+        return found
     if "action" in file and "observations/images" in file:
         return _aloha(file)
-    return None
+    places = (each for each in (file, data) if isinstance(each, h5py.Group))
+    return next((found for place in places if (found := _in_a_row(place))), None)
 
 
 def _ours(file: Any) -> Layout | None:
@@ -129,26 +148,23 @@ def _ours(file: Any) -> Layout | None:
 
 
 def _robomimic(data: Any) -> Layout | None:
-    first = data[sorted(data, key=natural)[0]]
-    if "obs" not in first or "actions" not in first:
+    first: Any = data[sorted(data, key=natural)[0]]
+    if not _is_group(first) or "obs" not in first or "actions" not in first:
         return None
     seen, length = first["obs"], len(first["actions"])
     cameras = {name: f"obs/{name}" for name in seen if is_video(seen[name])}
     states = {name: f"obs/{name}" for name in seen if is_numbers(seen[name], length)}
     libero = "bddl_file_name" in data.attrs or "problem_info" in data.attrs
     name = "LIBERO" if libero else "robomimic"
-    return Layout(name, cameras, "actions", states, *_robosuite(data.attrs.get("env_args")))
+    control = robosuite(data.attrs.get("env_args"))
+    rows = first["actions"]
+    gripper = rows.ndim == 2 and rows.shape[1] == control.arm + 1 > 1
+    held = (control.arm,) if gripper else ()
+    return Layout(name, cameras, "actions", states, control.rate, control.kind, held=held)
 
 
-def _robosuite(env_args: Any) -> tuple[Fraction | None, ActionKind]:
-    """The control frequency and the kind of actions in the JSON of `env_args`."""
-    try:
-        settings = json.loads(env_args)["env_kwargs"]
-        rate = Fraction(settings["control_freq"]).limit_denominator(10**6)
-        relative = settings.get("controller_configs", {}).get("control_delta", False)
-    except (TypeError, ValueError, KeyError, AttributeError):
-        return None, "absolute"
-    return rate, "delta" if relative is True else "absolute"
+def _is_group(item: Any) -> bool:
+    return isinstance(item, h5py.Group)
 
 
 def _aloha(file: Any) -> Layout:
@@ -157,7 +173,60 @@ def _aloha(file: Any) -> Layout:
     seen = file["observations"]
     states = {name: f"observations/{name}" for name in seen if is_numbers(seen[name], length)}
     note = "50 frames per second, which ALOHA's recorders have and its files do not say."
-    return Layout("ALOHA", cameras, "action", states, ALOHA_RATE, note=note)
+    return Layout("ALOHA", cameras, "action", states, ALOHA_RATE, "absolute", note)
+
+
+def _in_a_row(group: Any) -> Layout | None:
+    """Arrays of all episodes in a row, with others that say where each begins or ends."""
+    actions = next((name for name in ("action", "actions") if name in group), "")
+    if not actions or not isinstance(group[actions], h5py.Dataset):
+        return None
+    length = len(group[actions])
+    cameras = {name: name for name in group if is_video(group[name])}
+    if not cameras or not bounds_in(group, length):
+        return None
+    states = {n: n for n in group if is_numbers(group[n], length) and not is_bound(n, actions)}
+    ours = {"ep_len", "ep_offset"} <= {*group}
+    name = "stable-worldmodel" if ours else "arrays of all episodes"
+    return Layout(name, cameras, actions, states)
+
+
+def is_bound(name: str, actions: str) -> bool:
+    """Whether an array is the actions or says where episodes are, and so is no state."""
+    bare = plain(name)
+    return name == actions or divides(name) or bare in NUMBERS | LAST | FIRST | {"step_idx"}
+
+
+def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
+    """The episodes in the rows of a group; None if they are one.
+
+    What says it may lie beside the arrays, in a group ``meta`` there, or, if the group is the only
+    one, in those above it.
+
+    Args:
+        group: the group.
+        count: number of rows of its actions.
+        alone: whether no other group of the file holds episodes.
+
+    Raises:
+        DataError: arrays contradict each other.
+    """
+    for place in (group, group.parent, group.file) if alone else (group,):
+        beside = place.get("meta")
+        for part in (place, *([beside] if isinstance(beside, h5py.Group) else [])):
+            found = {
+                name: item[()]
+                for name, item in part.items()
+                if isinstance(item, h5py.Dataset) and item.ndim in (1, 2) and _tells(name)
+            }
+            where = f"{group.file.filename} ({', '.join(found)})"
+            if found and (bounds := bounds_of(found, count, where, flags=alone)):
+                return bounds
+    return None
+
+
+def _tells(name: str) -> bool:
+    return divides(name) or plain(name) in NUMBERS | LAST | FIRST
 
 
 def is_video(item: Any) -> bool:

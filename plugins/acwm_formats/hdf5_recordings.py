@@ -7,34 +7,63 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
+from acwm_formats.channels import Channels
 from acwm_formats.frames import ImageFrames, file_stamp, regular_times
 from acwm_formats.hdf5_layouts import Layout, array, opened
 from acwm_formats.labels import Labels
 from acwm_formats.timeline import Samples, TimedRecording
 
+LONGEST = 1000  # characters of a text that is kept
+
+
+class Place(NamedTuple):
+    """Where one episode lies.
+
+    Attributes:
+        path: the file.
+        group: the name of its group.
+        number: its place among the episodes in the rows of the group; None if it is the only one.
+        start, stop: its rows; all by default.
+    """
+
+    path: Path
+    group: str
+    number: int | None = None
+    start: int = 0
+    stop: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What its owner knows it by."""
+        group = "" if self.group == "/" else f" {self.group}"
+        number = "" if self.number is None else f" episode {self.number}"
+        return f"{self.path.name}{group}{number}"
+
 
 @dataclass(frozen=True)
 class HDF5Recordings:
-    """Episodes by file and group.
+    """Episodes by file, group and rows.
 
     Attributes:
-        places: the file and the group of each.
+        places: where each lies.
         layout: where things lie in the group.
         rate: frames per second.
         pixel_range: values that are black and white, see `images.to_rgb`.
     """
 
-    places: Mapping[int, tuple[Path, str]]
+    places: Mapping[int, Place]
     layout: Layout
     rate: Fraction
     pixel_range: tuple[float, float] | None = None
+    channels: Channels | None = None
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -46,31 +75,38 @@ class HDF5Recordings:
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
-        path, name = self.places[index]
+        place, path = self.places[index], self.places[index].path
         ours = self.layout.name == "acwm"
         try:
-            group = _file(path, file_stamp(path))[name]
-            actions = rows(array(group, self.layout.actions))
+            group = _file(path, file_stamp(path))[place.group]
+            actions = rows(array(group, self.layout.actions), place)
             states = {
-                state: Samples(rows(array(group, where)))
+                state: Samples(rows(array(group, where), place))
                 for state, where in self.layout.states.items()
             }
             cameras = {
-                camera: self._frames(path, f"{name}/{where}", len(array(group, where)))
+                camera: self._frames(place, where, len(array(group, where)))
                 for camera, where in self.layout.cameras.items()
             }
-            labels, facts = (_labels(path, group), _facts(group)) if ours else (None, {})
+            labels, facts = (_labels(path, group), _facts(group)) if ours else (None, texts(group))
         except (OSError, KeyError, RuntimeError, ValueError) as error:
             raise DataError(f"{path} cannot be read ({error})") from error
-        title = path.name if name == "/" else f"{path.name} {name}"
         return TimedRecording(
-            title, cameras, Samples(actions), states, self.rate, facts=facts, labels=labels
+            place.title, cameras, Samples(actions), states, self.rate, facts=facts, labels=labels
         )
 
-    def _frames(self, path: Path, name: str, count: int) -> ImageFrames:
-        times = regular_times(count, self.rate)
-        stamp = f"{name} {file_stamp(path)}"
-        return ImageFrames(StoredImages(path, name, count), times, self.pixel_range, stamp=stamp)
+    def _frames(self, place: Place, where: str, count: int) -> ImageFrames:
+        stop = count if place.stop is None else place.stop
+        name = f"{place.group}/{where}"
+        images = StoredImages(place.path, name, max(0, min(stop, count) - place.start), place.start)
+        rows = "" if place.number is None else f" {place.start} {stop}"
+        return ImageFrames(
+            images,
+            regular_times(len(images), self.rate),
+            self.pixel_range,
+            channels=self.channels,
+            stamp=f"{name}{rows} {file_stamp(place.path)}",
+        )
 
 
 def _labels(path: Path, group: Any) -> Labels:
@@ -88,20 +124,44 @@ def _facts(group: Any) -> dict[str, Any]:
     return {name: value for name, value in simulated.items() if value} | facts
 
 
+def texts(group: Any) -> dict[str, str]:
+    """The texts that describe an episode: attributes of its group, and arrays of one text.
+
+    Long ones, such as the source of a simulator's model, are left out.
+    """
+    found: dict[str, str] = {}
+    items = [*group.attrs.items()] + [
+        (name, item[()] if item.ndim == 0 else item[0])
+        for name, item in group.items()
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "SO" and item.size == 1
+    ]
+    try:  # of LIBERO, where it is the same for all
+        told = parse_json(group.parent.attrs["problem_info"])
+        items.append(("language_instruction", told["language_instruction"]))
+    except (KeyError, TypeError, ValueError):
+        pass
+    for name, value in items:
+        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        if isinstance(text, str) and 0 < len(text) <= LONGEST:
+            found[name] = text
+    return found
+
+
 @dataclass(frozen=True)
 class StoredImages(Sequence[Any]):
-    """The images of a dataset, read one by one; rows of bytes are files of pictures."""
+    """The images of a dataset, from `first` on; rows of bytes are files of pictures."""
 
     path: Path
     name: str
     length: int
+    first: int = 0
 
     def __len__(self) -> int:
         return self.length
 
     def __getitem__(self, index: Any) -> Any:
         try:
-            image = _file(self.path, file_stamp(self.path))[self.name][index]
+            image = _file(self.path, file_stamp(self.path))[self.name][self.first + index]
         except (OSError, KeyError, RuntimeError, ValueError) as error:
             raise DataError(f"{self.path} cannot be read ({error})") from error
         if isinstance(image, bytes):
@@ -109,15 +169,15 @@ class StoredImages(Sequence[Any]):
         return image.tobytes() if image.ndim == 1 and image.dtype == np.uint8 else image
 
 
-def rows(found: Any) -> NDArray[Any]:
-    """Numbers with a row per frame, ``[N, …]``.
+def rows(found: Any, place: Place) -> NDArray[Any]:
+    """Numbers with a row per frame, ``[N, …]``, of one episode.
 
     Raises:
         DataError: they are no numbers.
     """
     if found.dtype.kind not in "fiub":
         raise DataError(f"{found.name} of {found.file.filename} holds {found.dtype}, no numbers")
-    values = found[()]
+    values = found[place.start : place.stop]
     return values[:, None] if values.ndim == 1 else values
 
 

@@ -18,6 +18,7 @@ from acwm_core.env.episode import SPLITS, Split
 from acwm_formats.alignment import Alignment
 from acwm_formats.bounds import action_bounds, beyond, outliers
 from acwm_formats.reading import ImportOptions, Reading, Scan
+from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.timeline import RecordedDataset
 
 UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
@@ -85,8 +86,9 @@ class Described:
         shard_episodes: int,
         kept: Sequence[Scan],
         skipped: Sequence[str] = (),
+        rate: ActionRate | None = None,
     ) -> DatasetCard:
-        """The card of the dataset that holds the recordings `kept`."""
+        """The card of the dataset that holds the recordings `kept`, whose actions have a rate."""
         present = [split for split in SPLITS if any(each.split == split for each in kept)]
         rows = {split: _rows([k for k in kept if k.split == split]) for split in present}
         basis = rows.get("train", np.zeros((0, 0), np.float32))
@@ -108,8 +110,11 @@ class Described:
             views=self.reading.cameras if len(self.reading.cameras) > 1 else (),
             instances=self.reading.instances,
         )
-        told = {"plan": plan, "notes": self._notes(kept, rows, action)}
-        source = {**self.recorded.facts, **told, **self.command()}
+        notes = self._notes(kept, rows, action)
+        if rate:
+            notes.insert(0, f"{rate.sentence[0].upper()}{rate.sentence[1:]}.")
+        about = {"plan": plan, "notes": notes, **(rate.to_source() if rate else {})}
+        source = {**self.recorded.facts, **about, **self.command()}
         if skipped:
             source["skipped"] = list(few(skipped))
         return DatasetCard(
@@ -126,7 +131,7 @@ class Described:
     def _action(self, rows: NDArray[np.float32]) -> ActionSpec:
         """What the actions are, with bounds of `rows` if none are stated."""
         action, kinds = self.reading.action, self.options.alignment.kinds
-        action = replace(action, kind=max(kinds, key=kinds.count))
+        action = replace(action, kind=max(kinds, key=kinds.count) if kinds else action.kind)
         if self.reading.stated:
             return action
         low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
@@ -152,7 +157,7 @@ class Described:
         if alignment.shift:
             unit = "frame" if abs(alignment.shift) == 1 else "frames"
             notes.append(f"Actions were moved by {alignment.shift} {unit}.")
-        told = [f"{each.name}: {note}" for each in kept for note in each.notes]
+        told = _told([(each.name, note) for each in kept for note in each.notes])
         told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
         others = [name for name in self.cameras if name not in self.reading.cameras]
         if others:
@@ -174,7 +179,8 @@ class Described:
             and ",".join(f"{each:g}" for each in asked.depth_range),
         }
         kinds = ",".join(alignment.kinds)
-        words["action_kind"] = None if kinds == self.recorded.actions.kind else kinds
+        known = ",".join(self.recorded.actions.kinds(self.reading.action.size))
+        words["action_kind"] = None if kinds == known else kinds
         names = ("fps", "tolerance", "max_gap", "shift", "on_defect")
         changed = {name: getattr(alignment, name) for name in names}
         return words | {n: v for n, v in changed.items() if v != getattr(usual, n)}
@@ -184,6 +190,19 @@ def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
     """Rows of the actions of some recordings ``[N, A]``."""
     rows = [each.actions for each in kept if len(each.actions)]
     return np.concatenate(rows) if rows else np.zeros((0, 0), np.float32)
+
+
+def _told(notes: Sequence[tuple[str, str]]) -> list[str]:
+    """Notes with the names of their recordings; what is said of many is said once."""
+    names: dict[str, list[str]] = {}
+    for name, note in notes:
+        names.setdefault(note, []).append(name)
+    return [
+        f"{some[0]}: {note}"
+        if len(some) == 1
+        else f"{len(some)} recordings, e.g. {some[0]}: {note}"
+        for note, some in names.items()
+    ]
 
 
 def few(lines: Sequence[str]) -> Sequence[str]:

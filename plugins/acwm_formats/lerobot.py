@@ -32,7 +32,7 @@ from acwm_formats.lerobot_layout import (
     read_info,
     read_places,
 )
-from acwm_formats.names import word
+from acwm_formats.names import is_action, text_note, word
 from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
 
 FRAME, REWARD = "frame_index", "next.reward"
@@ -83,7 +83,7 @@ class LeRobot(Format):
                 options={},
                 actions=_action(features, ours),
                 state=tuple(_state(features)),
-                notes=() if ours else ("The units of actions are not known.",),
+                notes=() if ours else _notes(features, places),
                 summary=ours.summary if ours else f"{info.get('robot_type') or 'a robot'}",
             )
 
@@ -301,6 +301,14 @@ def _action(features: Mapping[str, Mapping[str, Any]], ours: EnvironmentCard | N
     names, shape = _names(features[ACTION]), features[ACTION].get("shape")
     fits = isinstance(shape, list) and [len(names)] == shape
     return ActionFacts(tuple(names) if fits else ())
+
+
+def _notes(features: Mapping[str, Any], places: Sequence[Place]) -> tuple[str, ...]:
+    """What people should know about how the dataset was read."""
+    notes = ["The units of actions are not known."]
+    if left := [name for name in features if is_action(name) and name != ACTION]:
+        notes.append(f"Features that were left out: {', '.join(left)}.")
+    return (*notes, *(text_note(["tasks"]) if any(place.tasks for place in places) else []))
 
 
 def _state(features: Mapping[str, Mapping[str, Any]]) -> list[StateField]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from acwm_core.errors import DataError
 from acwm_formats.frames import HDR
 from acwm_formats.images import to_rgb
-from acwm_formats.mcap_messages import Entry, content_of, entries
+from acwm_formats.mcap_messages import Entry, content_of, entries, stamp_of
 
 START = re.compile(rb"\x00\x00\x01(..?)", re.S)
 """The start of a unit in the byte stream of Annex B, and its header."""
@@ -151,7 +151,7 @@ class Camera:
     """Gathers the times of a topic's frames, and makes them readable."""
 
     def __init__(self, topic: str) -> None:
-        self.topic, self._times = topic, list[int]()
+        self.topic, self._times, self._stamps = topic, list[int](), list[int]()
         self._codec, self._first = "", 0
         self._before = True  # the first key frame
 
@@ -162,11 +162,17 @@ class Camera:
             self._before = not is_key(data_of(entry), self._codec)
             self._first += self._before
         self._times.append(entry.time)
+        self._stamps.append(stamp_of(entry.content()))
 
     @property
     def times(self) -> NDArray[np.int64]:
         """When each frame that can be decoded was logged, ``[N]`` in ns."""
         return np.array(self._times[self._first :], np.int64)
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """The times in the headers of the same frames, ``[N]`` in ns; 0 if there are none."""
+        return np.array(self._stamps[self._first :], np.int64)
 
     @property
     def logged(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -12,11 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import Writer
+from numpy.typing import NDArray
 from PIL import Image
 
 from acwm_core.errors import DataError, suggest
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
+from acwm_formats.mcap_clocks import Clock, Stamps, clock_note, times_of
 from acwm_formats.mcap_images import Camera, is_image, is_video
 from acwm_formats.mcap_messages import Column, Numbers, entries, topics
 from acwm_formats.names import natural, word, words
@@ -38,11 +41,13 @@ class Log(NamedTuple):
         cameras: the topics of images.
         actions: the topic of actions, perhaps followed by a colon and a field.
         states: topics of states, in the same way.
+        stamps: whose times to take.
     """
 
     cameras: tuple[str, ...]
     actions: str
     states: tuple[str, ...]
+    stamps: Stamps | None = None
 
 
 class MCAP(Format):
@@ -60,18 +65,21 @@ class MCAP(Format):
         video: str | None = None,
         actions: str | None = None,
         states: str | None = None,
+        stamps: Stamps | None = None,
     ) -> RecordedDataset:
         """Import an MCAP file, or a folder of them, one episode each.
 
         Messages of images (CompressedImage of ROS 2 or Foxglove), of video (CompressedVideo of
-        Foxglove in H.264 or H.265) and of numbers are brought together by the times at which they
-        were logged.
+        Foxglove in H.264 or H.265) and of numbers are brought together by the times in their
+        headers, or, where these have none of the same clock, at which they were logged.
 
         Args:
             root: the file or folder.
             video: Topics of images or video, with a comma between; all by default.
             actions: Topic of the actions, or TOPIC:FIELD; by default the only one with numbers.
             states: Topics of the states, or TOPIC:FIELD, with a comma between; none by default.
+            stamps: Whose times to take; by default those of headers that are of the log's clock, or
+                that all messages have.
         """
         root = Path(root)
         files = _files(root)
@@ -90,14 +98,16 @@ class MCAP(Format):
             if topic not in kinds:
                 raise DataError(f"{first} has no topic {topic!r}{suggest(topic, kinds)}")
         wanted, found = _actions(first, actions, [t for t in kinds if t not in filmed])
+        log = Log(cameras, wanted, words(states), stamps)
+        used = {*cameras, wanted.partition(":")[0], *asked}
         return RecordedDataset(
             name=word(root),
-            splits=Logs(tuple(files), Log(cameras, wanted, words(states))),
+            splits=Logs(tuple(files), log),
             facts={"kind": "mcap", "name": root.resolve().name, "files": len(files)}
             | {"bytes": sum(path.stat().st_size for path in files)},
-            options={"video": video, "actions": actions, "states": states},
+            options={"video": video, "actions": actions, "states": states, "stamps": stamps},
             actions=ActionFacts(found.names),
-            notes=(f"Actions are {wanted}; its times are those of the log.",),
+            notes=_notes(first, log, [topic for topic in kinds if topic not in used]),
             summary=f"Logs of {root.resolve().name}",
         )
 
@@ -127,22 +137,47 @@ class Logs:
         Frames of a video before its first key frame cannot, so it has fewer than it claims.
         """
         path, log = self.files[index], self.log
-        cameras = [Camera(topic) for topic in log.cameras]
-        columns = {name: Column(name) for name in (log.actions, *log.states)}
-        _gathered(path, cameras, columns)
-        zero = min((int(each.times[0]) for each in cameras if len(each.times)), default=0)
+        cameras, columns = _read(path, log)
+        numbers = {name: each.numbers() for name, each in columns.items()}
+        times = times_of(_clocks(cameras, numbers), log.stamps)
+        zero = min((int(times[each.topic][0]) for each in cameras if len(each.times)), default=0)
 
         def samples(name: str) -> Samples:
-            numbers = columns[name].numbers()
-            return Samples(numbers.rows, (numbers.times - zero) / 1e9)
+            return Samples(numbers[name].rows, (times[name] - zero) / 1e9)
 
         return TimedRecording(
             path.name,
-            {_name(each.topic): _frames(path, each, zero) for each in cameras},
+            {_name(c.topic): _frames(path, c, (times[c.topic] - zero) / 1e9) for c in cameras},
             samples(log.actions),
             {_name(name): samples(name) for name in log.states},
             length=cameras[0].logged if cameras[0].logged > len(cameras[0].times) else None,
         )
+
+
+def _read(path: Path, log: Log) -> tuple[list[Camera], dict[str, Column]]:
+    """What a file holds of the topics that are asked for."""
+    cameras = [Camera(topic) for topic in log.cameras]
+    columns = {name: Column(name) for name in (log.actions, *log.states)}
+    _gathered(path, cameras, columns)
+    return cameras, columns
+
+
+def _clocks(cameras: Sequence[Camera], numbers: Mapping[str, Numbers]) -> dict[str, Clock]:
+    clocks = {each.topic: Clock(each.times, each.stamps) for each in cameras}
+    return clocks | {name: Clock(each.times, each.stamps) for name, each in numbers.items()}
+
+
+def _notes(path: Path, log: Log, others: Sequence[str]) -> tuple[str, ...]:
+    """What people should know about how the logs were read, by the first."""
+    cameras, columns = _read(path, log)
+    known: dict[str, Numbers] = {}
+    with contextlib.suppress(DataError):  # opening it will tell
+        known = {name: each.numbers() for name, each in columns.items()}
+    told = clock_note(_clocks(cameras, known), log.stamps)
+    notes = [f"Actions are {log.actions}; {told}."]
+    if others:
+        notes.append(f"Topics that were left out: {', '.join(others)}.")
+    return tuple(notes)
 
 
 def _gathered(path: Path, cameras: Sequence[Camera], columns: Mapping[str, Column]) -> None:
@@ -155,9 +190,9 @@ def _gathered(path: Path, cameras: Sequence[Camera], columns: Mapping[str, Colum
             each.add(entry)
 
 
-def _frames(path: Path, camera: Camera, zero: int) -> ImageFrames:
+def _frames(path: Path, camera: Camera, times: NDArray[np.float64]) -> ImageFrames:
     stamp = f"{camera.topic} {file_stamp(path)}"
-    return ImageFrames(camera.images(path), (camera.times - zero) / 1e9, stamp=stamp)
+    return ImageFrames(camera.images(path), times, channels="rgb", stamp=stamp)
 
 
 def _name(topic: str) -> str:

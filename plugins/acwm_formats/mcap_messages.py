@@ -30,11 +30,13 @@ class Numbers(NamedTuple):
     Attributes:
         names: one per column.
         times: ``[N]`` when each message was logged, in ns.
+        stamps: ``[N]`` the times in the messages' headers, in ns; 0 if there are none.
         rows: ``[N, len(names)]``.
     """
 
     names: tuple[str, ...]
     times: NDArray[np.int64]
+    stamps: NDArray[np.int64]
     rows: NDArray[np.float64]
 
 
@@ -129,6 +131,7 @@ class Column:
     name: str
     names: tuple[str, ...] = ()
     times: list[int] = field(default_factory=list[int])
+    stamps: list[int] = field(default_factory=list[int])
     rows: list[list[float]] = field(default_factory=list[list[float]])
     problem: DataError | None = None
 
@@ -146,7 +149,8 @@ class Column:
                 self.problem = error
 
     def _add(self, entry: Entry) -> None:
-        found, asked = dict(_leaves(entry.content())), self.name.partition(":")[2]
+        content, asked = entry.content(), self.name.partition(":")[2]
+        found = dict(_leaves(content))
         if asked:
             found = {n: v for n, v in found.items() if re.split(r"[.\[]", n)[0] == asked}
         if not found:
@@ -158,6 +162,7 @@ class Column:
                 f"{len(self.names)}"
             )
         self.times.append(entry.time)
+        self.stamps.append(stamp_of(content))
         self.rows.append(list(found.values()))
 
     def numbers(self) -> Numbers:
@@ -170,7 +175,30 @@ class Column:
             raise self.problem
         if not self.rows:
             raise DataError(f"there is no message of {self.name}")
-        return Numbers(self.names, np.array(self.times, np.int64), np.array(self.rows))
+        times, stamps = np.array(self.times, np.int64), np.array(self.stamps, np.int64)
+        return Numbers(self.names, times, stamps, np.array(self.rows))
+
+
+def stamp_of(message: Any) -> int:
+    """The time in the header of a message, or in its field `timestamp`, in ns; 0 if it has none."""
+    header = content_of(message, "header") if _fields(message) is not None else None
+    for place in (header, message):
+        for name in ("stamp", "timestamp"):
+            time = content_of(place, name) if place is not None else None
+            if (found := _nanoseconds(time)) is not None:
+                return found
+    return 0
+
+
+def _nanoseconds(time: Any) -> int | None:
+    """A time as ROS, Foxglove or Protobuf have it: seconds and nanoseconds."""
+    if time is None or isinstance(time, int | float | str | bytes | list):
+        return None
+    parts = [
+        next((p for n in names if isinstance(p := content_of(time, n), int)), None)
+        for names in (("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos"))
+    ]
+    return None if parts[0] is None else parts[0] * 10**9 + (parts[1] or 0)
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, float]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,14 +19,19 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import parse_json
+from acwm_formats.channels import Channels
 from acwm_formats.format import Format
-from acwm_formats.frames import ImageFrames, file_stamp, regular_times
+from acwm_formats.frames import ImageFrames, file_stamp, regular_times, stack_note
 from acwm_formats.images import CHANNELS
-from acwm_formats.names import exact, pair, typed, word
+from acwm_formats.names import exact, pair, text_note, typed, word
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 METADATA = "metadata.json"
 OWN = "minari_version"
+SAME_COUNT = (
+    "it has as many observations as steps, so its last action leads to no frame, unless each "
+    "observation is the one after its action: then --shift -1 is right"
+)
 BROKEN = (OSError, ValueError, KeyError, TypeError, AssertionError, RuntimeError, IndexError)
 """Exceptions of the library for files that are damaged."""
 
@@ -48,6 +54,7 @@ class Minari(Format):
         video: str | None = None,
         rate: float | None = None,
         pixel_range: tuple[int, ...] | None = None,
+        channels: Channels | None = None,
     ) -> RecordedDataset:
         """Import a Minari dataset, whose observations are images or have some.
 
@@ -56,6 +63,7 @@ class Minari(Format):
             video: Name of the images, if observations are a dict; the first by default.
             rate: Frames per second; by default those of the environment's spec, if it says them.
             pixel_range: Values that are black and white, e.g. 0,1.
+            channels: What four channels are (rgba), or which of stacked grey frames is the newest.
         """
         root = Path(root)
         storage, metadata = _storage(root), _metadata(root)
@@ -70,13 +78,16 @@ class Minari(Format):
         if said is None:
             raise DataError(f"{root} does not say how many frames it has per second: give --rate")
         names = tuple(cameras) if video is None else (video,)
+        recordings = MinariRecordings(root, names, said, pair(pixel_range), channels)
         return RecordedDataset(
             name=word(root.parent if root.name == "data" else root),
-            splits=MinariRecordings(root, names, said, pair(pixel_range)),
+            splits=recordings,
             facts={"kind": "minari", "name": str(metadata.get("dataset_id", root.name))}
             | {"episodes": int(storage.total_episodes), "steps": int(storage.total_steps)},
-            options={"video": video, "rate": rate, "pixel_range": typed(pixel_range)},
+            options={"video": video, "rate": rate, "pixel_range": typed(pixel_range)}
+            | {"channels": channels},
             actions=_action(storage.action_space),
+            notes=_notes(recordings, [name for name in cameras if name not in names]),
             summary=str(metadata.get("description") or "A dataset of Minari"),
         )
 
@@ -116,6 +127,7 @@ class MinariRecordings:
     cameras: tuple[str, ...]
     rate: Fraction
     pixel_range: tuple[float, float] | None
+    channels: Channels | None = None
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -131,17 +143,49 @@ class MinariRecordings:
                 StoredImages(self.root, index, name, len(seen[name])),
                 regular_times(len(seen[name]), self.rate),
                 self.pixel_range,
+                channels=self.channels,
                 stamp=f"{index} {name} {file_stamp(_data(self.root) / METADATA)}",
             )
             for name in self.cameras
         }
         states = {
-            name: Samples(values.reshape(len(values), -1))
+            name: Samples(np.reshape(values, (len(values), -1)))
             for name, values in seen.items()
-            if name not in self.cameras and values.ndim <= 2 and values.dtype.kind in "fiub"
+            if name not in self.cameras
+            and np.ndim(values) <= 2
+            and np.asarray(values).dtype.kind in "fiub"
         }
         actions = Samples(_vectors(episode["actions"], space))
-        return TimedRecording(f"episode {index}", cameras, actions, states, self.rate)
+        count = len(next(iter(cameras.values())).images)
+        notes = (SAME_COUNT,) if len(actions.values) == count else ()
+        return TimedRecording(
+            f"episode {index}",
+            cameras,
+            actions,
+            states,
+            self.rate,
+            facts=_texts(seen),
+            notes=notes,
+        )
+
+
+def _texts(seen: Mapping[str, Any]) -> dict[str, Any]:
+    """Observed texts: one, or those that follow each other."""
+    found: dict[str, Any] = {}
+    for name, values in seen.items():
+        if np.asarray(values).dtype.kind in "UO" and all(isinstance(v, str) for v in values):
+            each = list(dict.fromkeys(map(str, values)))
+            found[name] = each[0] if len(each) == 1 else each
+    return found
+
+
+def _notes(recordings: MinariRecordings, others: Sequence[str]) -> tuple[str, ...]:
+    """What people should know about how the dataset was read."""
+    notes = [f"Images that were left out: {', '.join(others)} (--video NAME)."] if others else []
+    with contextlib.suppress(DataError, IndexError):
+        first = recordings[0]
+        notes += [*stack_note(first.cameras.values()), *text_note(first.facts)]
+    return tuple(notes)
 
 
 @dataclass(frozen=True)

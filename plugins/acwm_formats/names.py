@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
@@ -20,6 +21,18 @@ def word(path: Path) -> str:
     name = path.resolve().name.partition(".")[0]
     plain = re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
     return f"{plain}_recorded" if plain in catalog().registry("environment") else plain
+
+
+def is_action(name: str) -> bool:
+    """Whether a column or array is called an action: action, actions, action_x, action.gripper."""
+    return re.match(r"actions?(\W|_|\d|$)", name.lower()) is not None
+
+
+def text_note(facts: Iterable[str]) -> list[str]:
+    """A sentence for people about texts that were kept; none if there are none."""
+    names = ", ".join(facts)
+    kept = f"Texts were kept as facts of the episodes: {names}. No model reads them."
+    return [kept] if names else []
 
 
 def words(text: str | None) -> tuple[str, ...]:

@@ -111,7 +111,7 @@ OPTIONS = (
     _option(
         ["--test-episodes"],
         "How many of the last recordings become ind_test; by default those that the source names, "
-        "or if it names none a tenth, at least two.",
+        "or if it names none a tenth, at least five (of fewer than ten recordings two).",
         type=click.IntRange(0),
     ),
 )

@@ -223,7 +223,7 @@ def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
         notes.append(f"The actions are {size}-D: read as {known.name}, a variant of {name}.")
     actions = ActionFacts(
         known.action.names if known else tuple(f"action_{i}" for i in range(size)),
-        kind=known.action.kind if known else "absolute",
+        kind=known.action.kind if known else None,
         bounds=((-1.0,) * size, (1.0,) * size),
         widened=True,
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from acwm_core.env.card import ActionSpec, StateField, out_of_bounds
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmError, DataError, suggest
+from acwm_core.evaluation.statistics import MIN_EPISODES
 from acwm_core.executors import Report
 from acwm_formats.alignment import Aligned, Alignment, Defect, PlannedEpisode, align
 from acwm_formats.sizes import shrunk, target_size
@@ -33,7 +34,8 @@ class ImportOptions:
         depth_range: distances in metres that become white and black in depth maps.
         environment: name of the environment, instead of the one that the format gives.
         test_episodes: how many of the last recordings become `ind_test`, if the source has no test
-            episodes; a tenth by default, at least two.
+            episodes; a tenth by default, and at least the five that a verdict takes (of fewer than
+            ten recordings two).
         bounds: whether the bounds of actions are the range of the training episodes, or the range
             without the outermost hundredth at either end, to which all actions are then cut.
         alignment: how frames and actions are brought together.
@@ -190,6 +192,7 @@ class Scan:
         notes: what was filled or left out.
         rate: frames per second, 0 if unknown.
         seconds: how long it is.
+        per_frame, unused: actions per frame, and the share at no frame, as in `Aligned`.
         actions: rows of its actions ``[N, A]``: evenly chosen ones, and the least and the greatest.
         keys: what identifies each episode, see `Reading.key`.
     """
@@ -202,6 +205,8 @@ class Scan:
     notes: tuple[str, ...] = ()
     rate: float = 0.0
     seconds: float = 0.0
+    per_frame: float = 1.0
+    unused: float = 0.0
     actions: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     keys: tuple[str, ...] = ()
 
@@ -242,6 +247,8 @@ def scanned(
         tuple(aligned.notes),
         aligned.rate,
         aligned.seconds,
+        aligned.per_frame,
+        aligned.unused,
         _sample(np.concatenate(rows), sampled) if rows else np.zeros((0, 0), np.float32),
         keys,
     )
@@ -311,7 +318,7 @@ def _action(recorded: RecordedDataset, shape: Sequence[int]) -> ActionSpec:
     if len(names) != size:
         raise DataError(f"{len(names)} names are given for {size} dimensions of the actions")
     low, high = facts.bounds or ((-1.0,) * size, (1.0,) * size)
-    return ActionSpec(names, facts.units or ("",) * size, low, high, facts.kind)
+    return ActionSpec(names, facts.units or ("",) * size, low, high, facts.kind or "absolute")
 
 
 def divided(
@@ -335,12 +342,19 @@ def divided(
         }
         return {split: (recordings, part) for split, part in own.items() if len(part)}
     if test_episodes is None:
-        test_episodes = max(2, count // 10) if count > 2 else 0
+        test_episodes = _tests(count)
     if count and not 0 <= test_episodes < count:
         raise DataError(f"{test_episodes} of {count} episodes cannot be set aside for tests")
     first = count - test_episodes
     parts: dict[Split, range] = {"train": range(first), "ind_test": range(first, count)}
     return {split: (recordings, part) for split, part in parts.items() if len(part)}
+
+
+def _tests(count: int) -> int:
+    """How many of the recordings become test episodes, if nobody says it."""
+    if count < 2 * MIN_EPISODES:
+        return 2 if count > 2 else 0
+    return max(MIN_EPISODES, count // 10)
 
 
 def stated_rates(recorded: RecordedDataset, first: TimedRecording) -> list[Fraction]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from acwm_core.data.card import CARD, DatasetCard, other_dataset, package_versions
 from acwm_core.data.generate import fill
 from acwm_core.env.card import plain_rate
@@ -19,6 +21,7 @@ from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import LocalExecutor, progress_bar
 from acwm_core.files import held, writing, written_whole
+from acwm_formats.action_rates import Parts, action_rate
 from acwm_formats.alignment import Defect
 from acwm_formats.cadence import QUARTER, SAME, common_rate
 from acwm_formats.import_cards import Described, few
@@ -40,9 +43,6 @@ from acwm_formats.timeline import RecordedDataset, Recordings, TimedRecording
 ROWS = 1_000_000  # about how many rows of actions are looked at for their bounds
 AT_ONCE = 64  # recordings that one task looks at
 MOST_TOGETHER = 16  # recordings that one task decodes, if there are thousands
-
-Parts = Mapping[Split, tuple[Recordings, Sequence[int]]]
-"""The recordings of each split, and the places in them of those that belong to it."""
 
 
 def import_dataset(
@@ -75,13 +75,13 @@ def import_dataset(
         ShapeError: the frame size is not possible.
     """
     options = options or ImportOptions()
-    if not options.alignment.kinds:
-        kinds = (recorded.actions.kind,)
-        options = replace(options, alignment=replace(options.alignment, kinds=kinds))
     parts = divided(recorded, options.test_episodes)
     if not parts:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
     first = _first(recorded, parts, options.cameras)
+    if not options.alignment.kinds:
+        kinds = recorded.actions.kinds(np.shape(first.actions.values)[-1])
+        options = replace(options, alignment=replace(options.alignment, kinds=kinds))
     job = _Import(
         recorded,
         Path(out),
@@ -123,6 +123,7 @@ class _Import:
         """Look, decode, and fill the folder."""
         scans = [] if self.recorded.costly else self._looked_at()
         fps = self._rate(scans)
+        self._ask_kind(scans)
         bad = {(each.split, each.index): [*each.defects] for each in scans if each.defects}
         for each in scans:
             bad.setdefault((each.split, each.index), []).extend(self._of_another_rate(each, fps))
@@ -140,10 +141,22 @@ class _Import:
             staged = self._decoded(fps, {place for place, defects in bad.items() if defects})
             kept, skipped = self._sound(bad, staged)
             scans = [each.scan for each in kept]
-            card = self.described.card(fps, plan, shard_episodes, scans, skipped)
+            again = not self.recorded.costly
+            rate = action_rate(kept, self.parts, self.reading, staging, again=again)
+            card = self.described.card(fps, plan, shard_episodes, scans, skipped, rate)
             made = self._filled(card, kept)
         shutil.rmtree(staging, ignore_errors=True)
         return made
+
+    def _ask_kind(self, scans: Sequence[Scan]) -> None:
+        """Ask what actions command, if holding them would likely be wrong."""
+        facts, kinds = self.recorded.actions, self.options.alignment.kinds
+        if facts.ask and not kinds and any(each.unused for each in scans):
+            most = max(each.per_frame for each in scans)
+            raise DataError(
+                f"actions come {most:.3g} times per frame, and the files do not say what they "
+                "command: give --action-kind absolute, velocity, torque or delta"
+            )
 
     def _tell(self, defects: Sequence[Defect]) -> None:
         """Tell defects as soon as they are known, since decoding may take hours."""

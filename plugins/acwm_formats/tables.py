@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import json
+import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import parse_json
+from acwm_formats.episode_bounds import NUMBERS, bounds_of, divides, plain
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 
@@ -23,16 +26,20 @@ SECONDS = {"_ns": 1e-9, "_us": 1e-6, "_ms": 1e-3, "_s": 1.0, "": 1.0}
 """Length of a unit of time in seconds, by the end of the column's name."""
 
 TIMES = ("time", "timestamp", "timestamps", "t", "seconds", "stamp")
-FRAMES = ("frame", "frame_index", "frame_id")
-EPISODES = ("episode", "episode_index", "episode_id", "video", "file", "filename")
+FRAMES = (
+    *("frame", "frame_index", "frame_id", "frame_idx", "frame_number"),
+    *("step", "step_index", "step_idx"),
+)
+EPISODES = ("video", "file", "filename")
+EPISODE = "episode"
 """Names of columns that are no actions, without the unit at their end."""
 
 
 def read_table(path: Path) -> Table:
-    """Read the columns of a table; columns without a name are left out.
+    """Read the columns of a table; a column without a name that counts the rows is left out.
 
     Raises:
-        DataError: the file is missing, damaged, empty or ragged.
+        DataError: the file is missing, damaged, empty, ragged, or does not name its columns.
     """
     try:
         rows = READERS[path.suffix.lower()](path)
@@ -42,14 +49,26 @@ def read_table(path: Path) -> Table:
         reason = " ".join(str(e).split())[:200] or type(e).__name__
         raise DataError(f"the table {path} cannot be read ({reason})") from e
     columns: dict[str, NDArray[Any]] = {}
-    for name, values in rows.items():
-        columns |= _split(name, values)
+    for name, values in _numbered(rows, path).items():
+        split = _split(name, values)
+        if twice := next((each for each in split if each in columns), None):
+            raise DataError(f"{path} has two columns called {twice}: give them other names")
+        columns |= split
     if len({len(values) for values in columns.values()}) > 1:
         lengths = {name: len(values) for name, values in columns.items()}
         raise DataError(f"the columns of {path} differ in length: {lengths}")
     if not any(map(len, columns.values())):
         raise DataError(f"the table {path} holds no row")
+    if "" in columns and not _counts(columns[""]):
+        raise DataError(f"the table {path} has a column without a name: write one above it")
     return {name: values for name, values in columns.items() if name}
+
+
+def _counts(column: NDArray[Any]) -> bool:
+    """Whether a column is the number of each row, from 0 or 1, as pandas writes it."""
+    if column.dtype.kind not in "iu" or not len(column):
+        return False
+    return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
 
 
 def numbers(table: Table, names: Sequence[str], path: Path) -> NDArray[np.float64]:
@@ -98,9 +117,34 @@ def special_column(table: Table, names: Sequence[str]) -> str | None:
     return next((name for name in table if _bare(name) in names), None)
 
 
+def episode_column(table: Table) -> str | None:
+    """The column that tells the episode of each row, if there is one."""
+    return next((name for name in table if _is_episode(name)), None)
+
+
+def _is_episode(name: str) -> bool:
+    return plain(name) in NUMBERS or _bare(name) in EPISODES
+
+
 def action_columns(table: Table) -> list[str]:
     """The columns that are neither times nor numbers of frames or episodes."""
-    return [name for name in table if _bare(name) not in (*TIMES, *FRAMES, *EPISODES)]
+    return [n for n in table if _bare(n) not in (*TIMES, *FRAMES) and not _is_episode(n)]
+
+
+def _numbered(rows: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    """The columns, with a number of the episode in place of arrays that say where episodes are."""
+    arrays = {name: np.asarray(values) for name, values in rows.items()}
+    edges = {n: v for n, v in arrays.items() if divides(n) and v.ndim == 1}
+    counts = {len(v) for n, v in arrays.items() if n not in edges and v.ndim}
+    if not edges or len(counts) != 1 or {len(v) for v in edges.values()} == counts:
+        return rows
+    (count,) = counts
+    bounds = bounds_of(edges, count, f"{path} ({', '.join(edges)})") or [(0, count)]
+    numbers = np.zeros(count, np.int64)
+    for number, (start, stop) in enumerate(bounds):
+        numbers[start:stop] = number
+    kept = {name: values for name, values in rows.items() if name not in edges}
+    return kept if any(map(_is_episode, kept)) else {**kept, EPISODE: numbers}
 
 
 def seconds(table: Table, name: str, path: Path) -> NDArray[np.float64]:
@@ -140,6 +184,7 @@ def _csv(path: Path) -> dict[str, Any]:
     csv: Any = importlib.import_module("pyarrow.csv")
     with path.open("rb") as file:
         head = file.readline()
+    _check_head(head)
     delimiter = max((",", ";", "\t"), key=lambda each: head.count(each.encode()))
     kept = csv.ConvertOptions(strings_can_be_null=True)
     with path.open("rb") as file:
@@ -149,8 +194,23 @@ def _csv(path: Path) -> dict[str, Any]:
     return _columns(table)
 
 
+def _check_head(head: bytes) -> None:
+    """Refuse a first line of numbers: it is no header, and would be lost."""
+    cells = re.split(r"[,;\t]", head.decode("utf-8-sig", "replace").strip())
+    cells = [cell.strip().strip("\"'") for cell in cells]
+    if all(map(_is_number, filter(None, cells))) and any(cells):
+        shown = ", ".join(cells[:4])
+        raise ValueError(
+            f"its first line is numbers ({shown}): write the names of the columns above it"
+        )
+
+
 def _parquet(path: Path) -> dict[str, Any]:
     parquet: Any = importlib.import_module("pyarrow.parquet")
+    with path.open("rb") as file:
+        names = parquet.read_schema(file).names
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"it has two columns called {twice}: name them apart")
     with path.open("rb") as file:
         return _columns(parquet.read_table(file))
 
@@ -160,6 +220,8 @@ def _columns(table: Any) -> dict[str, Any]:
     types = arrow.types
     found: dict[str, Any] = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
+        if name in found:
+            raise ValueError(f"it has two columns called {name or 'nothing'}: name them apart")
         if types.is_nested(column.type):
             found[name] = np.array(column.to_pylist())
         elif types.is_temporal(column.type):
@@ -179,12 +241,25 @@ def _npz(path: Path) -> dict[str, Any]:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    return _records(parse_json(path.read_bytes()))
+    return _records(_parsed(path.read_bytes()))
 
 
 def _jsonl(path: Path) -> dict[str, Any]:
     lines = path.read_bytes().splitlines()
-    return _records([parse_json(line) for line in lines if line.strip()])
+    return _records([_parsed(line) for line in lines if line.strip()])
+
+
+def _parsed(data: bytes) -> Any:
+    found = parse_json(data)  # which keeps the last of two entries of one name
+    json.loads(data, object_pairs_hook=_unlike)
+    return found
+
+
+def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise ValueError(f"it has two columns called {twice}: name them apart")
+    return dict(pairs)
 
 
 def _records(value: Any) -> dict[str, Any]:

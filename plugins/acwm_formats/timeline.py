@@ -97,6 +97,7 @@ class TimedRecording:
         length: number of frames that the source claims.
         facts: what else is known of the episode, for JSON: `task`, `reward`, …
         labels: masks and contacts, if the frames are labelled.
+        notes: what people should know about it, a phrase each.
     """
 
     name: str
@@ -107,6 +108,7 @@ class TimedRecording:
     length: int | None = None
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
     labels: Labels | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -176,16 +178,27 @@ class ActionFacts:
     Attributes:
         names: one per dimension; ``action_0``, … if it is empty.
         units: one per dimension; none if it is empty.
-        kind: what an action commands.
+        kind: what an action commands; None if the source does not say it. They are held then, and
+            if frames do not take all of them, the import asks.
         bounds: lower and upper bounds that are stated. None: those of the training episodes.
         widened: the training episodes widen the bounds; else an action beyond them is a defect.
+        held: dimensions that are absolute whatever the kind is, such as a gripper's.
+        ask: an unknown kind is likely not absolute, so nothing is resampled before it is stated.
     """
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    kind: ActionKind = "absolute"
+    kind: ActionKind | None = None
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     widened: bool = False
+    held: tuple[int, ...] = ()
+    ask: bool = False
+
+    def kinds(self, size: int) -> tuple[ActionKind, ...]:
+        """The kind of each of `size` dimensions, or of all; none if it is not known."""
+        if self.kind is None or not self.held:
+            return (self.kind,) if self.kind else ()
+        return tuple("absolute" if place in self.held else self.kind for place in range(size))
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,15 @@ from acwm_core.errors import DataError, suggest
 from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
-from acwm_formats.names import exact, natural, word, words
+from acwm_formats.names import exact, is_action, natural, text_note, word, words
 from acwm_formats.sources import VIDEOS
 from acwm_formats.tables import (
-    EPISODES,
     FRAMES,
     READERS,
     TIMES,
     Table,
     action_columns,
+    episode_column,
     holds_numbers,
     number_column,
     numbers,
@@ -51,11 +51,18 @@ class Place(NamedTuple):
         name: the name of its video or folder, without an ending.
         cameras: a video file, or a folder of pictures, by the name of the camera.
         table: the file with its actions; None if there is none, or one for all.
+        tables: names of several that could be it.
+        begins: what the names of its pictures begin with, if the folder holds several episodes.
+        rows: its first row, the row after its last and the number of all, in a table for all whose
+            rows belong to pictures by their place.
     """
 
     name: str
     cameras: Mapping[str, Path]
     table: Path | None
+    tables: tuple[str, ...] = ()
+    begins: str = ""
+    rows: tuple[int, int, int] | None = None
 
 
 class Columns(NamedTuple):
@@ -67,6 +74,7 @@ class Columns(NamedTuple):
         time: the column of times in seconds; None if there is none.
         frame: the column of numbers of frames; None if there is none.
         episode: the column that names the episode, in a table for all.
+        texts: names of the columns that hold text, which are kept as facts.
     """
 
     actions: tuple[str, ...]
@@ -74,6 +82,7 @@ class Columns(NamedTuple):
     time: str | None
     frame: str | None
     episode: str | None
+    texts: tuple[str, ...] = ()
 
 
 class Videos(Format):
@@ -103,7 +112,8 @@ class Videos(Format):
         Each video in ROOT (mp4, mov, mkv, webm, avi, gif), or folder of pictures, has a table of
         the same name: csv, tsv, npy, npz, json, jsonl or parquet. Or ROOT has a folder per episode,
         with a video or folder of pictures per camera and one table. Or one table in ROOT is for
-        all, and a column of it, such as episode or video, tells which. Rows belong to frames by a
+        all, and a column of it, such as episode or video, tells which; pictures called
+        ep_0_step_0.png and the like are an episode per first number. Rows belong to frames by a
         column of times (time, timestamp, t; time_ms and the like are in that unit), by a column
         frame, or by their place.
 
@@ -181,17 +191,11 @@ class VideoFolder:
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
         place = self.places[index]
-        path = self.table or place.table
-        if path is None:
-            raise DataError(f"there is no table of actions beside {place.name}")
-        rows = _read_once(path, file_stamp(path)) if self.table else read_table(path)
-        if self.table and self.columns.episode:
-            column = self.columns.episode
-            rows = _rows_of(rows, column, index, place, self.count, path)
+        rows, path = self._rows(place, index)
         times = None
         if self.columns.time:
             times = seconds(rows, self.columns.time, path)
-        cameras = {name: self._frames(source, times) for name, source in place.cameras.items()}
+        cameras = {n: self._frames(p, times, place.begins) for n, p in place.cameras.items()}
         first = next(iter(cameras.values()))
         samples = self._samples(rows, path, self._same_clock(times, first.times, path))
         rate = None
@@ -200,13 +204,40 @@ class VideoFolder:
         names = self.columns.states
         states = {name: samples(number_column(rows, name, path)[:, None]) for name in names}
         actions = samples(numbers(rows, self.columns.actions, path))
-        return TimedRecording(place.name, cameras, actions, states, rate)
+        facts = {name: _text(rows[name]) for name in self.columns.texts if name in rows}
+        return TimedRecording(place.name, cameras, actions, states, rate, facts=facts)
 
-    def _frames(self, source: Path, times: NDArray[np.float64] | None) -> Frames:
+    def _rows(self, place: Place, index: int) -> tuple[Table, Path]:
+        """The rows of an episode, and the file that they are in."""
+        path = self.table or place.table
+        if self.table is None and place.tables:
+            several = ", ".join(place.tables)
+            raise DataError(
+                f"{place.name} has several tables ({several}): keep one, or name it by --actions"
+            )
+        if path is None:
+            raise DataError(f"there is no table of actions beside {place.name}")
+        rows = _read_once(path, file_stamp(path)) if self.table else read_table(path)
+        column = self.columns.episode if self.table else episode_column(rows)
+        if self.table and column:
+            return _rows_of(rows, column, index, place, self.count, path), path
+        if column and (known := len({*rows[column].tolist()})) > 1:
+            raise DataError(
+                f"the column {column} of {path} tells {known} episodes apart, and {place.name} is "
+                "one: record a video for each"
+            )
+        if self.table and place.rows:
+            start, stop, count = place.rows
+            if (found := len(next(iter(rows.values())))) != count:
+                raise DataError(f"{path} has {found} rows, and its episodes have {count} pictures")
+            rows = {name: values[start:stop] for name, values in rows.items()}
+        return rows, path
+
+    def _frames(self, source: Path, times: NDArray[np.float64] | None, begins: str) -> Frames:
         """A video, or pictures with the times of `rate` or else of the table's rows."""
         if source.is_file():
             return VideoFrames(source)
-        paths = _pictures(source)
+        paths = [path for path in _pictures(source) if _begins(path) == begins or not begins]
         if self.rate:
             times = regular_times(len(paths), exact(self.rate))
         elif times is None or len(times) != len(paths):
@@ -248,26 +279,67 @@ def find_places(root: Path, actions: str | None = None) -> list[Place]:
         if path.name.startswith((".", "_")):
             continue
         if path.suffix.lower() in VIDEOS and path.is_file():
-            found.append(Place(path.stem, {"video": path}, _table_of(root, path.stem)))
+            tables = _tables_of(root, path.stem)
+            found.append(_tabled(path.stem, {"video": path}, tables))
         elif path.is_dir():
             found += _folder(root, path, actions)
-    return found
+    return found or _grouped(root, None)
 
 
 def _folder(root: Path, folder: Path, actions: str | None) -> list[Place]:
     """The episode that a folder is: pictures, or a video or folder of pictures per camera."""
     inner = [path for path in _tables(folder) if actions is None or path.name == actions]
-    table = inner[0] if len(inner) == 1 else _table_of(root, folder.name)
+    tables = inner or _tables_of(root, folder.name)
     if _pictures(folder):
-        return [Place(folder.name, {"video": folder}, table)]
+        several = _grouped(folder, tables[0] if len(tables) == 1 else None)
+        return several or [_tabled(folder.name, {"video": folder}, tables)]
     cameras = {
         path.stem if path.is_file() else path.name: path
         for path in sorted(folder.iterdir(), key=_order)
         if path.suffix.lower() in VIDEOS or (path.is_dir() and _pictures(path))
     }
-    if not cameras or len(inner) > 1:
+    return [_tabled(folder.name, cameras, tables)] if cameras else []
+
+
+def _tabled(name: str, cameras: Mapping[str, Path], tables: Sequence[Path]) -> Place:
+    """An episode with its table, or with several of which none is chosen."""
+    if len(tables) == 1:
+        return Place(name, cameras, tables[0])
+    return Place(name, cameras, None, tuple(path.name for path in tables))
+
+
+def _grouped(folder: Path, table: Path | None) -> list[Place]:
+    """The episodes of a folder whose pictures are numbered anew in each, as ``ep_0_step_0.png``.
+
+    Raises:
+        DataError: they are the pictures of several cameras.
+    """
+    groups: dict[str, list[int]] = {}
+    for path in _pictures(folder):
+        number = re.search(r"(\d+)\D*$", path.stem)
+        groups.setdefault(_begins(path), []).append(int(number[1]) if number else -1)
+    first = next(iter(groups.values()), [])
+    anew = all(n == [*range(n[0], n[0] + len(n))] and n[0] == first[0] for n in groups.values())
+    if len(groups) < 2 or not anew or not all(re.search(r"\d", begins) for begins in groups):
         return []
-    return [Place(folder.name, cameras, table)]
+    if re.match(r"(cam|camera|view|eye)", next(iter(groups)).lower()):
+        raise DataError(f"{folder} has pictures of several cameras: put each into a folder")
+    ends = np.cumsum([len(numbers) for numbers in groups.values()]).tolist()
+    starts = [0, *ends[:-1]]
+    return [
+        Place(_title(begins), {"video": folder}, table, (), begins, (start, stop, ends[-1]))
+        for begins, start, stop in zip(groups, starts, ends, strict=True)
+    ]
+
+
+def _begins(path: Path) -> str:
+    """The name of a picture up to its last number."""
+    return re.sub(r"\d+\D*$", "", path.stem)
+
+
+def _title(begins: str) -> str:
+    """What an episode of pictures is called: the part of their names up to its number."""
+    return re.sub(r"\D+$", "", begins)
 
 
 def _order(path: Path) -> list[tuple[int, str]]:
@@ -283,16 +355,19 @@ def _tables(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in READERS)
 
 
-def _table_of(root: Path, stem: str) -> Path | None:
+def _tables_of(root: Path, stem: str) -> list[Path]:
     paths = (root / f"{stem}{ending}" for ending in READERS)
-    return next((path for path in paths if path.is_file()), None)
+    return [path for path in paths if path.is_file()]
 
 
 def _shared(root: Path, places: Sequence[Place], actions: str | None) -> Path | None:
     """The table for all episodes, if there is one."""
     if actions and (root / actions).is_file():
         return root / actions
-    if any(place.table for place in places):
+    own = {place.table for place in places}
+    if len(places) > 1 and len(own) == 1 and None not in own:
+        return own.pop()  # of a folder with the pictures of all
+    if any(place.table or place.tables for place in places):
         return None
     tables = _tables(root)
     if len(tables) > 1:
@@ -339,16 +414,21 @@ def _columns(
     for name in (*actions, *states, *words(time)):
         if name not in table:
             raise DataError(f"{path} has no column {name!r}{suggest(name, table)}")
-    if not actions:
-        free = [name for name in action_columns(table) if name not in (*states, time)]
-        numeric = [name for name in free if holds_numbers(table[name])]
-        called = [name for name in numeric if re.match(r"actions?(\W|_|\d|$)", name.lower())]
-        actions = tuple(called or numeric)
+    free = [name for name in action_columns(table) if name not in (*states, time, *actions)]
+    numeric = [name for name in free if holds_numbers(table[name])]
+    actions = actions or tuple([name for name in numeric if is_action(name)] or numeric)
     if not actions:
         raise DataError(f"{path} has no column of actions, only {', '.join(table)}")
-    episode = special_column(table, EPISODES) if shared else None
+    episode = episode_column(table) if shared else None
     time = time or special_column(table, TIMES)
-    return Columns(actions, states, time, special_column(table, FRAMES), episode)
+    texts = tuple(name for name in free if name not in numeric)
+    return Columns(actions, states, time, special_column(table, FRAMES), episode, texts)
+
+
+def _text(column: NDArray[Any]) -> str | list[str]:
+    """The text of an episode; a list if it changes, of each once."""
+    known = [str(value) for value in dict.fromkeys(column.tolist()) if value is not None]
+    return known[0] if len(known) == 1 else known
 
 
 def _facts(places: Sequence[Place], table: Path | None) -> dict[str, Any]:
@@ -361,13 +441,38 @@ def _facts(places: Sequence[Place], table: Path | None) -> dict[str, Any]:
 
 def _notes(root: Path, places: Sequence[Place], path: Path, chosen: Columns) -> tuple[str, ...]:
     left = [name for name in read_table(path) if name not in {*chosen.actions, *chosen.states}]
-    left = [name for name in left if name not in chosen[2:]]
+    left = [name for name in left if name not in (chosen.time, chosen.frame, chosen.episode)]
     notes = [f"Actions are the columns {', '.join(chosen.actions)}."]
     if left:
-        notes.append(f"Columns that were left out: {', '.join(left)}.")
+        notes.append(f"Columns that are neither actions nor states: {', '.join(left)}.")
+    notes += text_note(chosen.texts)
+    if places[0].begins:
+        notes.append(f"Pictures are {len(places)} episodes, by the first number in their names.")
     if chosen.time is None and chosen.frame is None:
         notes.append("Rows belong to frames by their place: the tables have no column of times.")
     used = {place.table for place in places} | {path}
     if lone := [table.name for table in _tables(root) if table not in used]:
         notes.append(f"Tables without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
+    if chosen.episode and (names := read_table(path)[chosen.episode]).dtype.kind not in "iuf":
+        films = {n for p in places for n in (p.name, *(each.name for each in p.cameras.values()))}
+        if lone := sorted({str(name) for name in names.tolist()} - films):
+            notes.append(f"Rows without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
+    if unread := _unread(root, places, used):
+        notes.append(
+            f"Files that were not read: {', '.join(unread[:5])}{' …' * (len(unread) > 5)}."
+        )
     return tuple(notes)
+
+
+def _unread(root: Path, places: Sequence[Place], tables: set[Path | None]) -> list[str]:
+    """Names of files and folders beside the recordings that are none."""
+    used = {path for place in places for path in place.cameras.values()} | tables
+    used |= {path.parent for path in used if path and path.parent != root}
+    return [
+        path.name
+        for path in sorted(root.iterdir(), key=_order)
+        if path not in used
+        and not path.name.startswith((".", "_"))
+        and path.suffix.lower() not in READERS
+        and not (root in used and path.suffix.lower() in PICTURES)
+    ]

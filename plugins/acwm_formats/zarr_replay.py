@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
@@ -17,13 +18,22 @@ from zarr.errors import BaseZarrError
 from zarr.storage import ZipStore
 
 from acwm_core.errors import DataError, suggest
+from acwm_formats.channels import Channels
+from acwm_formats.episode_bounds import bounds_of, divides
 from acwm_formats.format import Format
-from acwm_formats.frames import ImageFrames, regular_times
+from acwm_formats.frames import ImageFrames, regular_times, stack_note
 from acwm_formats.images import CHANNELS
 from acwm_formats.names import exact, pair, typed, word, words
 from acwm_formats.timeline import RecordedDataset, Samples, TimedRecording
 
 ENDS = "meta/episode_ends"
+PLACES = (
+    ENDS,
+    *("data/episode_ends", "episode_ends", "meta/episode_lengths", "data/episode_lengths"),
+    *("episode_lengths", "meta/ep_len", "data/ep_len", "ep_len"),
+)
+"""Arrays that say where episodes end, or how long they are; the first that is there counts."""
+
 ACTIONS = ("action", "actions")
 CODECS = (
     *(
@@ -55,8 +65,8 @@ class ZarrReplay(Format):
         """Whether there is an array ``meta/episode_ends``, or it is called ``.zarr.zip``."""
         if path.name.endswith(".zarr.zip"):
             return path.is_file()
-        names = (".zarray", "zarr.json")
-        return any((path / ENDS / name).is_file() for name in names)
+        files = (".zarray", "zarr.json")
+        return any((path / place / file).is_file() for place in PLACES for file in files)
 
     def read(
         self,
@@ -67,8 +77,11 @@ class ZarrReplay(Format):
         actions: str | None = None,
         states: str | None = None,
         pixel_range: tuple[int, ...] | None = None,
+        channels: Channels | None = None,
     ) -> RecordedDataset:
         """Import a Zarr replay buffer with data/… of all episodes and meta/episode_ends.
+
+        Arrays of other names that say where episodes are, such as meta/episode_lengths, will do.
 
         Args:
             root: the folder, or a .zarr.zip file.
@@ -77,9 +90,11 @@ class ZarrReplay(Format):
             actions: Name of the actions in data; action by default.
             states: Names of the states to keep; by default all other numbers.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
+            channels: What four channels are (rgba), or which of stacked grey frames is the newest.
         """
         buffer = Buffer(Path(root))
-        found = {name: buffer.array(f"data/{name}") for name in buffer.names()}
+        names = [name for name in buffer.names() if not divides(name)]
+        found = {name: buffer.array(f"data/{name}") for name in names}
         for name, array in found.items():
             if array.shape[0] != buffer.ends[-1]:
                 rows = f"{array.shape[0]} rows, and the last episode ends at {buffer.ends[-1]}"
@@ -93,11 +108,14 @@ class ZarrReplay(Format):
         kept = tuple(_chosen(buffer, states, found, others))
         options = {"rate": rate, "video": video, "actions": actions, "states": states}
         name = Path(root).resolve().name
+        options["channels"] = channels
+        recordings = ZarrRecordings(
+            buffer, tuple(cameras), action[0], kept, exact(rate), pair(pixel_range), channels
+        )
+        used = {*cameras, *action, *kept}
         return RecordedDataset(
             name=word(Path(root)),
-            splits=ZarrRecordings(
-                buffer, tuple(cameras), action[0], kept, exact(rate), pair(pixel_range)
-            ),
+            splits=recordings,
             facts={
                 "kind": "zarr",
                 "name": name,
@@ -105,6 +123,7 @@ class ZarrReplay(Format):
                 "frames": buffer.ends[-1],
             },
             options=options | {"pixel_range": typed(pixel_range)},
+            notes=_notes(recordings, [name for name in found if name not in used]),
             summary=f"The replay buffer {name}",
         )
 
@@ -131,6 +150,7 @@ class ZarrRecordings:
     states: tuple[str, ...]
     rate: Fraction
     pixel_range: tuple[float, float] | None
+    channels: Channels | None = None
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -149,12 +169,21 @@ class ZarrRecordings:
                 StoredImages(self.buffer, name, start, stop),
                 times,
                 self.pixel_range,
+                channels=self.channels,
                 stamp=f"{name} {start} {stop}",
             )
             for name in self.cameras
         }
         states = {name: rows(name) for name in self.states}
         return TimedRecording(f"episode {index}", cameras, rows(self.actions), states, self.rate)
+
+
+def _notes(recordings: ZarrRecordings, left: list[str]) -> tuple[str, ...]:
+    """What people should know about how the buffer was read."""
+    notes = [f"Arrays that were left out: {', '.join(left)}."] if left else []
+    with contextlib.suppress(DataError):
+        notes += stack_note(recordings[0].cameras.values())
+    return tuple(notes)
 
 
 @dataclass(frozen=True)
@@ -230,8 +259,18 @@ class Buffer:
 
     @functools.cached_property
     def ends(self) -> list[int]:
-        """Where each episode ends."""
-        ends = [int(end) for end in self.rows(ENDS, 0, None)]
+        """Where each episode ends.
+
+        Raises:
+            DataError: nothing says it, or what does contradicts itself.
+        """
+        place = next((each for each in PLACES if each in self._group), ENDS)
+        if place != ENDS and not place.endswith("episode_ends"):
+            lengths = self.rows(place, 0, None)
+            count, name = int(lengths.sum()), place.rpartition("/")[2]
+            whole = bounds_of({name: lengths}, count, f"{place} of {self.root}") or [(0, count)]
+            return [stop for _, stop in whole]
+        ends = [int(end) for end in self.rows(place, 0, None)]
         if not ends or any(end <= start for start, end in itertools.pairwise([0, *ends])):
             raise DataError(f"{ENDS} of {self.root} does not grow with each episode: {ends[:5]}")
         return ends

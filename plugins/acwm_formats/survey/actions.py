@@ -18,6 +18,7 @@ EPISODES = 4000  # most episodes whose actions are read
 ROWS = 400_000  # most rows of actions that are kept
 BINS = 40
 NARROW = 0.2  # share of the bounds within which nearly all values lie, if an outlier set them
+MOST_CHOICES = 18  # that a person names by numbers; a game pad has as many
 NEARLY = 0.01, 0.99  # quantiles
 FEW = 8  # values; an action with no more is a choice, and has no outliers
 
@@ -34,6 +35,8 @@ class ActionSummary:
         quantiles: its 1 % and 99 % quantile.
         mean, std: of its values.
         constant: whether it never changes.
+        choices: how many whole numbers from 0 or 1 on it takes, if only such: they may be choices;
+            0 otherwise.
         narrow: share of the bounds between the quantiles, if outliers make it small; else None.
         outside: share of values out of the bounds.
         edges: edges of the bins of the histogram.
@@ -49,6 +52,7 @@ class ActionSummary:
     mean: float
     std: float
     constant: bool
+    choices: int
     narrow: float | None
     outside: float
     edges: tuple[float, ...]
@@ -100,8 +104,16 @@ def _facts(spec: ActionSpec, place: int, values: NDArray[np.float64]) -> ActionS
         mean=float(values.mean()),
         std=float(values.std()),
         constant=most - least <= 1e-6 * max(abs(least), abs(most), 1e-12),
+        choices=_choices(values),
         narrow=share if share < NARROW and not choice else None,
         outside=float(((values < low - slack) | (values > high + slack)).mean()),
         edges=tuple(edges.tolist()),
         counts=tuple(counts.tolist()),
     )
+
+
+def _choices(values: NDArray[np.float64]) -> int:
+    """How many whole numbers in a row, from 0 or 1 on; 0 for amounts, and for on and off."""
+    known = np.unique(values)
+    whole = known[0] in (0, 1) and np.array_equal(known, known[0] + np.arange(len(known)))
+    return len(known) if whole and 3 <= len(known) <= MOST_CHOICES else 0

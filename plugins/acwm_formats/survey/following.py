@@ -84,10 +84,10 @@ def following(moments: Sequence[Moments]) -> Following | None:
     longest = float(np.median([len(each.actions) for each in moments]))
     reach = int(min(SHIFTS, (longest - BEFORE - 4) // 2))
     fit = [each for each in moments if len(each.actions) >= 2 * reach + BEFORE + 4]
-    varies = _varying(fit)
+    varies = varying(fit)
     if reach < 1 or len(fit) < FEWEST or not varies.any():
         return None
-    seen = _Seen(fit, varies, reach)
+    seen = Seen(fit, varies, reach)
     shifts = tuple(range(-reach, reach + 1))
     plain = np.stack([seen.plain(shift) for shift in shifts])  # [shift, action, group]
     new = np.stack([seen.new(shift) for shift in shifts])
@@ -103,15 +103,22 @@ def following(moments: Sequence[Moments]) -> Following | None:
     return Following(shifts, means, tuple(read.tolist()), follows, delay, confidence, count)
 
 
-def _varying(moments: Sequence[Moments]) -> NDArray[np.bool_]:
+def varying(moments: Sequence[Moments]) -> NDArray[np.bool_]:
+    """Which actions ever change, ``[A]``."""
     every = np.concatenate([each.actions for each in moments])
     return every.std(0) > 1e-6 * np.maximum(np.abs(every).max(0), 1e-12)
 
 
-class _Seen:
+class Seen:
     """Rows of all stretches, one for each frame from which all shifts stay within the stretch."""
 
-    def __init__(self, moments: Sequence[Moments], varies: NDArray[np.bool_], reach: int) -> None:
+    def __init__(
+        self,
+        moments: Sequence[Moments],
+        varies: NDArray[np.bool_],
+        reach: int,
+        changes_read: int = 1,
+    ) -> None:
         self.rows = [np.arange(reach + BEFORE, len(m.actions) - reach) for m in moments]
         self.actions = standard([m.actions[:, varies].astype(np.float64) for m in moments])
         changes = standard([motion(m.frames).astype(np.float64) for m in moments])
@@ -122,7 +129,13 @@ class _Seen:
             for c, p in zip(changes, places, strict=True)
         ]
         both = [np.concatenate(pair, 1) for pair in zip(changes, turned, strict=True)]
-        self.change = standard([b[r] for b, r in zip(both, self.rows, strict=True)])
+        nexts = range(changes_read)
+        self.change = standard(
+            [
+                np.concatenate([b[r + n] for n in nexts], 1)
+                for b, r in zip(both, self.rows, strict=True)
+            ]
+        )
         self.place = [p[r] for p, r in zip(places, self.rows, strict=True)]
         self.past = [
             np.concatenate([_clock(m.start + r), p, b[r - 1], c[r - 2]], 1)

@@ -11,6 +11,8 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import Split
+from acwm_core.evaluation.statistics import MIN_EPISODES
+from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.survey.actions import ActionSummary, action_facts
 from acwm_formats.survey.following import SHIFTS, Following, Moments, following
 from acwm_formats.survey.frames import FrameFacts
@@ -75,12 +77,19 @@ class Survey:
         """All sentences, the bad ones first."""
         every = [
             *_of_unread(self.unread),
+            *_of_rate(self.rate),
             *_of_following(self),
             *_of_actions(self),
             *_of_frames(self),
             *_of_duplicates(self),
+            *(_of_tests(self.lengths) if self.card.source else ()),
         ]
         return sorted(every, key=lambda each: ("bad", "note", "good").index(each.level))
+
+    @property
+    def rate(self) -> ActionRate | None:
+        """How often actions came in the recordings; None if once per frame, or nothing tells."""
+        return ActionRate.of_source(self.card.source or {})
 
     @property
     def headline(self) -> str:
@@ -90,6 +99,8 @@ class Survey:
             return "Too little to tell whether the video follows the actions"
         if not found.follows:
             return "Nothing in the video follows the actions"
+        if self.rate and self.rate.is_open:
+            return "The video follows the actions; when is open until their kind is known"
         if found.delay is None:
             return "The video follows the actions; when cannot be told"
         if found.confidence < SURE:
@@ -155,6 +166,12 @@ def _of_unread(unread: Unread) -> Iterator[Finding]:
         yield Finding("bad", f"{count} cannot be read, e.g. {split} {index}: {why}")
 
 
+def _of_rate(rate: ActionRate | None) -> Iterator[Finding]:
+    if rate and rate.is_open:
+        level = "bad" if rate.follows == "sum" else "note"
+        yield Finding(level, f"{rate.sentence}. {rate.question[0].upper()}{rate.question[1:]}")
+
+
 def _of_following(found: Survey) -> Iterator[Finding]:
     seen, says = found.following, found.headline
     if seen is None:
@@ -165,6 +182,8 @@ def _of_following(found: Survey) -> Iterator[Finding]:
             f"in {seen.episodes} episodes, frames tell no more of their own actions than others do"
         )
         yield Finding("bad", f"{says}: {why}; a model would learn to ignore them")
+    elif found.rate and found.rate.is_open:
+        yield Finding("note", says)
     elif seen.delay is None:
         yield Finding("note", f"{says}: actions change too steadily")
     elif seen.confidence < SURE:
@@ -192,6 +211,13 @@ def _of_actions(found: Survey) -> Iterator[Finding]:
             )
             advice = "; import it with --bounds quantile"
             yield Finding("bad", text + advice) if recorded else Finding("note", text)
+        if each.choices and recorded:
+            text = (
+                f"{each.name} takes the {each.choices} whole numbers from {each.least:g} to "
+                f"{each.most:g}: models read an amount. If they are choices, record a column of 0 "
+                "and 1 for each"
+            )
+            yield Finding("note", text)
         if each.outside:
             yield Finding("note", f"{each.outside:.2%} of {each.name} are out of its bounds")
 
@@ -209,6 +235,18 @@ def _of_frames(found: Survey) -> Iterator[Finding]:
         where = f"e.g. frame {frame} of {split} {episode}"
         level = "bad" if count > 0.05 * facts.frames else "note"
         yield Finding(level, f"{count} of {facts.frames:,} frames are {PHRASES[name]} ({where})")
+
+
+def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
+    if not lengths.keys() - {"train"}:
+        yield Finding("note", f"no test episodes: a verdict takes {MIN_EPISODES}")
+    for split, each in lengths.items():
+        if split != "train" and len(each) < MIN_EPISODES:
+            yield Finding(
+                "note",
+                f"{split} has {len(each)} episodes: an interval and a verdict take {MIN_EPISODES}. "
+                f"Record more, or import again with --test-episodes {MIN_EPISODES}",
+            )
 
 
 def _of_duplicates(found: Survey) -> Iterator[Finding]:

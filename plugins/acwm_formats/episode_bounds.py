@@ -1,0 +1,126 @@
+"""Where one recording ends and the next begins, in arrays that hold several in a row."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.errors import DataError
+
+Bounds = list[tuple[int, int]]
+"""The first row of each episode and the row after its last."""
+
+_WHOSE = ("ep", "eps", "episode", "episodes", "traj", "trajs", "trajectory", "demo", "rollout")
+
+
+def _names(*parts: str) -> frozenset[str]:
+    joined = (f"{whose}_{part}" for whose, part in itertools.product(_WHOSE, parts))
+    return frozenset(joined)
+
+
+LENGTHS = _names("len", "lens", "length", "lengths", "size", "sizes") | {"lengths"}
+STARTS = _names("offset", "offsets", "start", "starts", "begin", "begins", "from")
+ENDS = _names("end", "ends", "stop", "stops", "to")
+NUMBERS = _names("idx", "idxs", "index", "indices", "id", "ids", "num", "number", "no") | {
+    *_WHOSE,
+    "trajectories",
+}
+LAST = frozenset(
+    f"{name}{plural}"
+    for name in ("terminal", "timeout", "done", "termination", "truncation", "is_last")
+    for plural in ("", "s")
+) | {"terminated", "truncated", "is_terminal", "last"}
+FIRST = frozenset({"is_first", "first"})
+
+
+def plain(name: str) -> str:
+    """The name of an array or column as the sets above have it."""
+    return name.lower().strip().replace("-", "_").replace(" ", "_").replace(".", "_")
+
+
+def divides(name: str) -> bool:
+    """Whether an array of this name says where episodes begin or end, not what is in them."""
+    return plain(name) in LENGTHS | STARTS | ENDS
+
+
+def bounds_of(
+    found: Mapping[str, NDArray[Any]], count: int, where: str, *, flags: bool = True
+) -> Bounds | None:
+    """The episodes in `count` rows; None if no array says that there are several.
+
+    Args:
+        found: arrays that may say it, by name.
+        count: number of rows.
+        where: what holds them, for errors.
+        flags: whether flags such as ``terminals`` end an episode; it ends at the last of a run.
+
+    Raises:
+        DataError: they contradict each other or the number of rows.
+    """
+    arrays = {plain(name): np.asarray(values) for name, values in found.items()}
+    flat = {name: v for name, v in arrays.items() if v.ndim == 1 or v.shape[1:] == (1,)}
+    known = {name: v.reshape(-1) for name, v in flat.items() if v.dtype.kind in "biufSUO"}
+    whole = {name: v for name, v in known.items() if v.dtype.kind in "iuf" and len(v)}
+    edges = _edges(whole, count) or _runs(known, count, where)
+    if edges is None and flags:
+        edges = _flagged(known, count)
+    if edges is None:
+        return None
+    ordered = sorted(edges)
+    inside = ordered[0][0] >= 0 and ordered[-1][1] <= count
+    apart = all(stop <= start for (_, stop), (start, _) in itertools.pairwise(ordered))
+    if not (inside and apart and all(start < stop for start, stop in ordered)):
+        raise DataError(f"the episodes that {where} names do not fit its {count} rows")
+    if sum(stop - start for start, stop in ordered) != count:
+        rows = sum(stop - start for start, stop in ordered)
+        raise DataError(f"the episodes that {where} names have {rows} rows, and it has {count}")
+    return edges if len(edges) > 1 else None
+
+
+def _edges(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
+    """Told by lengths, starts or ends."""
+    lengths, starts, ends = (
+        next((v.astype(np.int64) for name, v in whole.items() if name in names), None)
+        for names in (LENGTHS, STARTS, ENDS)
+    )
+    if lengths is not None and (len(lengths) < count or starts is not None):
+        first = np.cumsum(lengths) - lengths if starts is None else starts
+        if len(first) == len(lengths):
+            return list(zip(first.tolist(), (first + lengths).tolist(), strict=True))
+    if ends is not None and len(ends) < count:
+        stops = ends + 1 if int(ends[-1]) == count - 1 else ends  # of the last row, or after it
+        return list(itertools.pairwise([0, *stops.tolist()]))
+    if starts is not None and len(starts) < count:
+        return list(itertools.pairwise([*starts.tolist(), count]))
+    return None
+
+
+def _runs(known: Mapping[str, NDArray[Any]], count: int, where: str) -> Bounds | None:
+    """Told by a number or name of the episode in each row."""
+    for name, values in known.items():
+        if name not in NUMBERS or len(values) != count or not count:
+            continue
+        changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+        if len({*values.tolist()}) != len(changes) + 1:
+            raise DataError(f"the rows of an episode are apart in {where}: sort them by {name}")
+        return list(itertools.pairwise([0, *changes.tolist(), count]))
+    return None
+
+
+def _flagged(known: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
+    """Told by flags of last or first rows."""
+    flags = {n: v.astype(float) != 0 for n, v in known.items() if v.dtype.kind in "biuf"}
+    last = [v for name, v in flags.items() if name in LAST and len(v) == count]
+    first = [v for name, v in flags.items() if name in FIRST and len(v) == count]
+    if first:
+        starts = np.flatnonzero(first[0])
+        return list(itertools.pairwise([0, *starts[starts > 0].tolist(), count]))
+    if last and count:
+        ended = np.any(last, axis=0)
+        stops = np.flatnonzero(ended & ~np.append(ended[1:], False)) + 1
+        return list(itertools.pairwise([0, *stops[stops < count].tolist(), count]))
+    return None

@@ -1,0 +1,207 @@
+"""Several recordings in one file, table or folder are read as several, or refused."""
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+
+from acwm_core.errors import DataError
+from acwm_formats.alignment import Alignment, align
+from acwm_formats.episode_bounds import bounds_of
+from acwm_formats.hdf5 import HDF5
+from acwm_formats.videos import Videos
+from acwm_formats.zarr_replay import ZarrReplay
+from tests.formats.corpus.cases import at
+from tests.formats.corpus.clips import Clip, write_clip, write_images
+from tests.formats.corpus.pictures import number_in, picture
+
+LENGTHS = (10, 12, 8, 9)
+ENDS = np.cumsum(LENGTHS)
+STARTS = ENDS - LENGTHS
+COUNT = int(ENDS[-1])
+NUMBERS = np.repeat(np.arange(4), LENGTHS)
+LAST = np.isin(np.arange(COUNT), ENDS - 1)
+FIRST = np.isin(np.arange(COUNT), STARTS)
+ROWS = np.stack([np.arange(COUNT), np.arange(COUNT) % 3], 1).astype(np.float32)
+
+SAYS = {
+    "lengths and offsets": {"ep_len": LENGTHS, "ep_offset": STARTS},
+    "lengths": {"episode_lengths": LENGTHS},
+    "ends": {"episode_ends": ENDS},
+    "last rows": {"traj_ends": ENDS - 1},
+    "starts": {"episode_starts": STARTS},
+    "a number": {"episode_index": NUMBERS},
+    "a number that counts on": {"ep_idx": NUMBERS + 7},
+    "a name": {"episode_id": np.array([b"a", b"b", b"c", b"d"])[NUMBERS]},
+    "terminals": {"terminals": LAST},
+    "timeouts too": {"terminals": LAST & (NUMBERS % 2 == 0), "timeouts": LAST & (NUMBERS % 2 == 1)},
+    "first rows": {"is_first": FIRST},
+}
+
+
+def frames():
+    return np.stack([picture(number, (32, 48)) for number in range(COUNT)])
+
+
+def file_of(path, says, *, group="/", beside="/"):
+    with h5py.File(path, "w") as file:
+        file.require_group(group)["pixels"] = frames()
+        file[group]["action"] = ROWS
+        file[group]["proprio"] = ROWS[:, :1]
+        for name, values in says.items():
+            file.require_group(beside)[name] = values
+    return path
+
+
+def are_the_four(recordings):
+    assert len(recordings) == 4
+    for index, (start, stop) in enumerate(zip(STARTS, ENDS, strict=True)):
+        recording = recordings[index]
+        np.testing.assert_array_equal(recording.actions.values, ROWS[start:stop])
+        (seen, *_) = recording.cameras.values()
+        assert len(seen.times) == stop - start
+        ends = [0, stop - start - 1]
+        assert [int(number_in(f)) for f in seen.read(ends)] == [start, stop - 1]
+    return True
+
+
+@pytest.mark.parametrize("says", SAYS.values(), ids=SAYS)
+@pytest.mark.parametrize(("group", "beside"), [("/", "/"), ("/", "meta"), ("data", "meta")])
+def test_arrays_of_all_episodes_in_hdf5(tmp_path, says, group, beside):
+    path = file_of(tmp_path / "all.h5", says, group=group, beside=beside)
+    found = HDF5().read(path, video="pixels", actions="action", rate=10)
+    assert are_the_four(found.splits)
+
+
+def test_files_of_stable_worldmodel_are_known(tmp_path):
+    path = file_of(tmp_path / "pusht.h5", SAYS["lengths and offsets"])
+    assert HDF5.detect(path)
+    with pytest.raises(DataError, match="give --rate"):
+        HDF5().read(path)
+    found = HDF5().read(path, rate=10)
+    assert found.facts["layout"] == "stable-worldmodel"
+    assert are_the_four(found.splits)
+    assert [*found.splits[1].states] == ["proprio"]
+    assert found.splits[2].name == "pusht.h5 episode 2"
+
+
+def test_the_row_after_the_last_action_may_be_empty(tmp_path):
+    """Its last action leads to no frame, and is stored as NaN."""
+    path = file_of(tmp_path / "all.h5", SAYS["lengths"])
+    with h5py.File(path, "a") as file:
+        for end in ENDS:
+            file["action"][end - 1] = np.nan
+    recording = HDF5().read(path, rate=10).splits[0]
+    found = align(recording, ["pixels"], Alignment())
+    assert found.defects == []
+    np.testing.assert_array_equal(found.episodes[0].actions[:-1], ROWS[:9])
+
+
+WRONG = {
+    "too few": {"ep_len": (10, 12, 8, 8)},
+    "too many": {"ep_len": LENGTHS, "ep_offset": STARTS + 1},
+    "one over another": {"ep_len": LENGTHS, "ep_offset": (0, 9, 22, 30)},
+    "apart": {"episode_index": np.where(np.arange(COUNT) == 38, 0, NUMBERS)},
+}
+
+
+@pytest.mark.parametrize("says", WRONG.values(), ids=WRONG)
+def test_what_contradicts_itself_is_refused(tmp_path, says):
+    path = file_of(tmp_path / "all.h5", says)
+    with pytest.raises(DataError, match="episode"):
+        HDF5().read(path, video="pixels", actions="action", rate=10).splits[0]
+
+
+def test_demonstrations_that_end_more_than_once_are_one_each(tmp_path):
+    """Where every episode has a group, flags do not divide it."""
+    with h5py.File(tmp_path / "mine.h5", "w") as file:
+        for run in "ab":
+            file[f"{run}/pixels"], file[f"{run}/action"] = frames(), ROWS
+            file[f"{run}/dones"] = LAST
+    found = HDF5().read(tmp_path / "mine.h5", video="pixels", actions="action", rate=10)
+    assert len(found.splits) == 2
+
+
+@pytest.mark.parametrize(
+    "says", [{"": None}, {"x": np.arange(COUNT)}, {"ep_len": [COUNT]}, {"episode": NUMBERS * 0}]
+)
+def test_one_recording_stays_one(says):
+    arrays = {name: np.asarray(values) for name, values in says.items() if name}
+    assert bounds_of(arrays, COUNT, "it") is None
+
+
+@pytest.mark.parametrize("place", ["meta/episode_ends", "data/episode_ends", "episode_ends"])
+def test_a_buffer_says_its_ends_in_several_places(tmp_path, place):
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    group.create_array("data/img", data=frames())
+    group.create_array("data/action", data=ROWS)
+    group.create_array(place, data=ENDS)
+    assert ZarrReplay.detect(tmp_path / "b.zarr")
+    assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
+
+
+def test_a_buffer_may_say_lengths(tmp_path):
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    group.create_array("data/img", data=frames())
+    group.create_array("data/action", data=ROWS)
+    group.create_array("meta/episode_lengths", data=np.array(LENGTHS))
+    assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
+
+
+NAMES = {
+    "of stable-worldmodel": "ep_{e}_step_{s}.png",
+    "with zeros": "episode_{e:03d}_frame_{s:06d}.png",
+    "two numbers": "{e}_{s}.png",
+    "from one": "traj{e1}-{s1}.png",
+}
+
+
+def pictured(folder, pattern):
+    write_images(folder, range(COUNT), "png")
+    for place, path in enumerate(
+        sorted(folder.iterdir(), key=lambda p: int(p.stem.split("_")[-1]))
+    ):
+        e = int(NUMBERS[place])
+        s = int(place - STARTS[e])
+        path.rename(folder / f"x{pattern.format(e=e, s=s, e1=e + 1, s1=s + 1)}")
+    for path in [*folder.iterdir()]:
+        path.rename(folder / path.name.removeprefix("x"))
+
+
+@pytest.mark.parametrize("pattern", NAMES.values(), ids=NAMES)
+@pytest.mark.parametrize("says", [{}, {"ep_len": LENGTHS, "ep_offset": STARTS}])
+@pytest.mark.parametrize("table", ["all.npz", "pixels/all.npz", "pixels.npz"])
+def test_pictures_of_several_episodes_in_one_folder(tmp_path, pattern, says, table):
+    pictured(tmp_path / "pixels", pattern)
+    np.savez(tmp_path / table, action=ROWS, **says)
+    found = Videos().read(tmp_path, rate=10)
+    assert are_the_four(found.splits)
+    assert any("4 episodes" in note for note in found.notes)
+
+
+def test_pictures_whose_rows_are_of_another_number_are_refused(tmp_path):
+    pictured(tmp_path / "pixels", NAMES["two numbers"])
+    np.savez(tmp_path / "all.npz", action=ROWS[:-1])
+    with pytest.raises(DataError, match="38 rows, and its episodes have 39 pictures"):
+        Videos().read(tmp_path, rate=10).splits[0]
+
+
+def test_pictures_by_time_or_camera_are_no_episodes(tmp_path):
+    folder = tmp_path / "a"
+    write_images(folder, range(6), "png")
+    for place, path in enumerate(sorted(folder.iterdir())):
+        path.rename(folder / f"{1700000000 + place // 2}_{place * 499 % 1000}.png")
+    (tmp_path / "a.csv").write_text("x\n" + "\n".join("123456"))
+    assert len(Videos().read(tmp_path, rate=10).splits) == 1
+    for place, path in enumerate(sorted(folder.iterdir())):
+        path.rename(folder / f"cam{place % 2}_{place // 2}.png")
+    with pytest.raises(DataError, match="several cameras"):
+        Videos().read(tmp_path, rate=10)
+
+
+@pytest.mark.parametrize("column", ["episode_index", "episode", "ep", "traj_id"])
+def test_one_video_of_several_episodes_is_refused(tmp_path, column):
+    write_clip(tmp_path / "a.mp4", range(6), at(*range(6)), 10, Clip())
+    (tmp_path / "a.csv").write_text(f"{column},x\n0,1\n0,2\n0,3\n1,4\n1,5\n1,6\n")
+    with pytest.raises(DataError, match=f"column {column} .* tells 2 episodes apart"):
+        Videos().read(tmp_path).splits[0]
