@@ -177,14 +177,14 @@ class PlannedEpisodes(EpisodeTable):
         player: plays them.
         rows: of `ROW_NAMES`.
         videos: folder of the videos.
-        filmed: seeds that get a video.
+        video_seeds: seeds that get a video.
     """
 
     def __init__(
-        self, player: EpisodePlayer, rows: Sequence[str], videos: Path, filmed: Sequence[int]
+        self, player: EpisodePlayer, rows: Sequence[str], videos: Path, video_seeds: Sequence[int]
     ) -> None:
         super().__init__(rows)
-        self._player, self._videos, self._filmed = player, videos, filmed
+        self._player, self._videos, self._video_seeds = player, videos, video_seeds
 
     def lines(self, seed: int, rows: Sequence[str]) -> Iterator[Line]:
         for row in rows:
@@ -193,7 +193,7 @@ class PlannedEpisodes(EpisodeTable):
             line: Line = {}
             with self.left.trying(row, seed):
                 result, controller = self._player.play(row, seed)
-                if seed in self._filmed:
+                if seed in self._video_seeds:
                     self._player.write_video(self._videos, row, seed, result, controller)
                 line = {"row": row, "seed": seed, **result.facts()}
             if line:

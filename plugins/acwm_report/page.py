@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import itertools
 import re
@@ -192,9 +193,17 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 
 def drawn_page(template: str, **content: Any) -> str:
     """Render a page. All content is escaped; it runs only its own script and loads nothing."""
-    made = templates(autoescape=True)
-    made.filters["quote"] = shlex.quote
-    made.globals.update(
+    text: str = _page_templates().get_template(template).render(**content)
+    (script,) = re.findall(r"<script>(.*)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return text.replace("SCRIPT-DIGEST", f"sha256-{digest}", 1)
+
+
+@functools.cache  # the page of a plan is written after every episode
+def _page_templates() -> Any:
+    pages = templates(autoescape=True)
+    pages.filters["quote"] = shlex.quote
+    pages.globals.update(
         action_traces=action_traces,
         branch_title=titles.branch_title,
         commands_of=commands,
@@ -206,10 +215,7 @@ def drawn_page(template: str, **content: Any) -> str:
         split_title=titles.split_title,
         version=acwm_core.__version__,
     )
-    text: str = made.get_template(template).render(**content)
-    (script,) = re.findall(r"<script>(.*)</script>", text, re.DOTALL)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return text.replace("SCRIPT-DIGEST", f"sha256-{digest}", 1)
+    return pages
 
 
 def _export(

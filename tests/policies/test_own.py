@@ -11,7 +11,7 @@ from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError
 from acwm_core.training.run import load_run
 from acwm_planning.policies.episode import true_outcome
-from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
+from acwm_planning.policies.judges import EpisodeSimulator, ModelJudge
 from acwm_planning.policies.own import OwnPolicy
 from tests import tiny
 
@@ -96,7 +96,7 @@ def module(tmp_path, monkeypatch):
 def stages(exact):
     bundle = load_run(exact)
     reader = tiny.SquareEstimator(bundle.card)
-    simulator = SimulatorJudge(tiny.task_environment(), 1, tiny.STRIDE, reader)
+    simulator = EpisodeSimulator(tiny.task_environment(), 1, tiny.STRIDE, reader)
     return simulator, ModelJudge(bundle.world_model, reader, tiny.PLACE)
 
 
@@ -132,7 +132,7 @@ def test_states_and_goals_are_for_those_that_ask(module, stages):
     for seed in range(3):
         start = simulator.start(tiny.spec(seed))
         policy = own(module, "Seeker")
-        true = simulator.perform(start, policy, 12)
+        true = true_outcome(simulator.play_own(start, policy, 12), start)
         seen = model.perform(start, policy, 12)
         assert true.success == seen.success
         assert seen.returns == pytest.approx(true.returns, abs=20)

@@ -8,7 +8,9 @@ from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmWarning, DataError, RecipeError
 from acwm_core.files import read_json
 from acwm_core.training.run import load_run
-from acwm_planning.policies.judges import ModelJudge, SimulatorJudge
+from acwm_planning.controllers import PolicyController
+from acwm_planning.policies.episode import true_outcome
+from acwm_planning.policies.judges import EpisodeSimulator, ModelJudge
 from acwm_planning.policies.ranking import RANKING_FILE, Ranking
 from acwm_planning.policies.run import Ranker, rank_policies
 from acwm_planning.policies.scripted import ScriptedPolicy, built_in_policies
@@ -22,9 +24,19 @@ pytestmark = pytest.mark.ci
 SEEDS = range(6)
 
 
+class Simulator(EpisodeSimulator):
+    """Stands in for a model: it judges as a `ModelJudge` does."""
+
+    batch = 1
+
+    def replay(self, start, actions):
+        played = (self.play(start, PolicyController.replaying(a), len(a)) for a in actions)
+        return [true_outcome(result, start) for result in played]
+
+
 def simulator(given=1):
     reader = tiny.SquareEstimator(tiny.Slide.card)
-    return SimulatorJudge(tiny.task_environment(), given, tiny.STRIDE, reader)
+    return Simulator(tiny.task_environment(), given, tiny.STRIDE, reader)
 
 
 def ranked(tmp_path, model, policies=None, seeds=SEEDS):

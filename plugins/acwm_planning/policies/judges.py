@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,37 +17,18 @@ from acwm_core.errors import noting
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
-from acwm_planning.controllers import Controller, PolicyController
+from acwm_planning.controllers import Controller
 from acwm_planning.episode import EpisodeResult, Start, play, start_of
 from acwm_planning.policies.episode import (
     Outcome,
     join_observations,
     read_outcome,
-    true_outcome,
 )
 from acwm_planning.policies.own import OwnController, OwnPolicy
 
 
-class Judge(ABC):
-    """Rolls out actions and policies, and judges the outcomes.
-
-    Attributes:
-        batch: number of action sequences that are rolled out at once.
-    """
-
-    batch: int = 1
-
-    @abstractmethod
-    def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """Outcomes of sequences of raw actions, `[T, A]` each."""
-
-    @abstractmethod
-    def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """Outcome of a policy that observes what this judge shows, after `steps` actions."""
-
-
-class SimulatorJudge(Judge):
-    """The true simulator.
+class EpisodeSimulator:
+    """The true simulator, in which policies act.
 
     Args:
         environment: the environment with its task.
@@ -84,17 +64,8 @@ class SimulatorJudge(Judge):
         """Play an episode with a user's policy, which observes true frames."""
         return self.play(start, OwnController(policy, self._estimator, self._stride), steps)
 
-    def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        replays = (
-            self.play(start, PolicyController.replaying(rows), len(rows)) for rows in actions
-        )
-        return [true_outcome(result, start) for result in replays]
 
-    def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        return true_outcome(self.play_own(start, policy, steps), start)
-
-
-class ModelJudge(Judge):
+class ModelJudge:
     """A world model whose frames an estimator reads.
 
     Args:
@@ -118,7 +89,10 @@ class ModelJudge(Judge):
         self._steps, self.batch = steps, batch
 
     def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
-        """All sequences get the same noise, so they differ only in actions."""
+        """Outcomes of sequences of raw actions, `[T, A]` each.
+
+        All sequences get the same noise, so they differ only in actions.
+        """
         outcomes: list[Outcome] = []
         for first in range(0, len(actions), self.batch):
             batch = np.stack(actions[first : first + self.batch])
@@ -146,7 +120,7 @@ class ModelJudge(Judge):
         ]
 
     def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
-        """The policy decides once per latent frame."""
+        """Outcome of a policy after `steps` actions; it decides once per latent frame."""
         given, between = self._given(start)
         seeds = [start.history.spec.index]
         stream = self._world.stream(given, between.to(self._device), steps=self._steps, seeds=seeds)

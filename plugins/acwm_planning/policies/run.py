@@ -28,7 +28,7 @@ from acwm_interventions.counterfactual import plan_branches
 from acwm_planning.controllers import PolicyController
 from acwm_planning.episode import EpisodeResult, Start, load_task, spec_of_seed
 from acwm_planning.policies.episode import Outcome, read_outcome, true_outcome
-from acwm_planning.policies.judges import Judge, ModelJudge, SimulatorJudge
+from acwm_planning.policies.judges import EpisodeSimulator, ModelJudge
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.ranking import RANKING_FILE, Ranking
 from acwm_planning.policies.scripted import (
@@ -64,8 +64,8 @@ class Ranker(EpisodeTable):
 
     def __init__(
         self,
-        simulator: SimulatorJudge,
-        model: Judge,
+        simulator: EpisodeSimulator,
+        model: ModelJudge,
         estimator: StateEstimator,
         policies: Sequence[ScriptedPolicy | OwnPolicy],
         script: ScriptedPolicy,
@@ -199,7 +199,7 @@ def rank_policies(
     try:
         environment = TaskEnvironment(inner, goal_task)
         stride = world.codec.temporal_stride
-        simulator = SimulatorJudge(environment, world.context_frames, stride, estimator)
+        simulator = EpisodeSimulator(environment, world.context_frames, stride, estimator)
         solved = is_solvable(inner, goal_task, first_start(simulator, card, seeds).goal)
         chosen = _parse_policies(policies, solved, goal_task, card)
         script = ScriptedPolicy("solution" if solved else "behaviour")
@@ -219,7 +219,7 @@ def rank_policies(
         inner.close()
 
 
-def first_start(simulator: SimulatorJudge, card: EnvironmentCard, seeds: Sequence[int]) -> Start:
+def first_start(simulator: EpisodeSimulator, card: EnvironmentCard, seeds: Sequence[int]) -> Start:
     """The start of the first seed that is not solved there."""
     for seed in seeds[:-1]:
         with contextlib.suppress(SolvedAtStartError):
