@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor, FactorValue
 from acwm_core.env.physics import (
@@ -17,11 +18,11 @@ from acwm_core.env.physics import (
     Level,
     Observation,
     Physics,
-    Reading,
     StateEstimator,
     States,
+    readings_of,
 )
-from acwm_core.env.symmetry import Symmetry, group, permuted
+from acwm_core.env.symmetry import Symmetry, group
 from acwm_core.errors import ShapeError
 from acwm_core.model.shapes import Clip
 
@@ -47,15 +48,20 @@ class Disc(Environment):
         factors=(GAIN, SHADE),
         ood_shifts=("gain", "shade"),
         state=(
-            StateField("position", (2,), "m", "from the middle of the frame, y down"),
-            StateField("bearing", (), "rad", "direction of the position, from x to y"),
+            StateField(
+                "position", (2,), "m", "from the middle of the frame, y down", "position", ("disc",)
+            ),
+            StateField(
+                "bearing", (), "rad", "direction of the position, from x to y", "angle", ("disc",)
+            ),
         ),
         instances=("background", "disc"),
         engine="numpy",
         symmetries=group(
-            Symmetry((-1, 2), mirrored=True, states={"position": (-1, 2)}),
-            Symmetry((2, -1), quarter_turns=1, states={"position": (2, -1)}),  # y is down
+            Symmetry((-1, 2), mirrored=True),
+            Symmetry((2, -1), quarter_turns=1),  # y is down
         ),
+        camera=Camera.flat(0.5, down=True),
     )
 
     def _start(self, factors: Mapping[str, FactorValue], rng: np.random.Generator) -> None:
@@ -66,7 +72,7 @@ class Disc(Environment):
         self.position = self.position + amount * rng.normal(0, 1e-3, 2)
 
     def _transform(self, symmetry: Symmetry) -> None:
-        self.position = permuted(self.position, symmetry.states["position"])
+        self.position = self.position @ (symmetry.plane * [[1, -1], [-1, 1]]).T  # y is down
 
     def _snapshot(self) -> Callable[[], None]:
         position = self.position.copy()
@@ -111,10 +117,7 @@ class DiscEstimator(StateEstimator):
     def physics(self) -> Physics:
         """One disc of constant size between walls."""
         return Physics(
-            readings=(
-                Reading("position", "position", ("disc",)),
-                Reading("bearing", "angle", ("disc",)),
-            ),
+            readings=readings_of(Disc.card.state, "position", "bearing"),
             objects=("disc",),
             shapes=("disc",),
             levels=(Level("disc", _height),),

@@ -16,12 +16,14 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from acwm_core.checks.result import NotTried, expect, expect_equal, expect_is_a
+from acwm_core.checks.scene import wrong_numbers, wrongly_following, wrongly_seen
 from acwm_core.checks.task import TaskChecks
 from acwm_core.checks.trial import BEGINNING
 from acwm_core.data.simulate import simulate
-from acwm_core.env.environment import Environment, EnvironmentCard, Policy
+from acwm_core.env.environment import Environment, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Episode, EpisodeSpec, Factor
-from acwm_core.env.symmetry import Symmetry, group, permuted
+from acwm_core.env.states import encode
+from acwm_core.env.symmetry import Symmetry, group
 
 CLOSE = 0.01
 """Mean difference of two frames, as a fraction of white, that counts as hardly visible."""
@@ -124,6 +126,26 @@ class EnvironmentChecks(TaskChecks):
         expect(masks.max() < len(names), f"mask id {masks.max()} has no name in `instances`")
         expect(masks.any(), "the mask shows nothing but background")
 
+    def states_are_of_their_kinds(self) -> None:
+        """Hold what the card declares: quaternions of length 1, presences of 0 or 1."""
+        for field in self.card.state:
+            problem = wrong_numbers(field, self.episode)
+            expect(not problem, problem)
+
+    def states_follow(self) -> None:
+        """Let a field that follows from others be alike whenever these are, in an episode."""
+        for field in self.card.state:
+            if field.follows:
+                sources = [self.card.fields[name] for name in field.follows]
+                problem = wrongly_following(field, sources, self.episode)
+                expect(not problem, problem)
+
+    def positions_are_in_the_masks(self) -> None:
+        """Show instances where the card's camera sees their positions."""
+        for field in self.card.state:
+            problem = wrongly_seen(field, self.card, self.beginning)
+            expect(not problem, problem)
+
     def contacts_match_card(self) -> None:
         """Report contacts between two different instances of the card."""
         known = range(len(self.card.instances))
@@ -216,24 +238,38 @@ class EnvironmentChecks(TaskChecks):
             self.environment, self.spec(), usual.actions, frames=BEGINNING, perturbation=1.0
         )
         return {
-            name: np.abs(values - np.asarray(usual.states[name], np.float64)).max()
-            for name, values in moved.states.items()
+            field.name: np.abs(_code(field, moved) - _code(field, usual)).max()
+            for field in self.card.state
         }
+
+    def _error(self, field: StateField, symmetry: Symmetry, turned: Episode) -> tuple[float, float]:
+        """How far a field of `turned` is from what `symmetry` makes of it, and its largest value.
+
+        Values that look alike are equal, and those of rows that do not exist do not count.
+        """
+        usual, found = (
+            np.asarray(each.states[field.name], np.float64) for each in (self.beginning, turned)
+        )
+        wanted = self.card.transformed(symmetry, field.name, usual)
+        if field.name in symmetry.headings:
+            off, largest = np.angle(np.exp(1j * (found - wanted)))[usual != 0], np.pi
+        else:
+            off = encode(field, found) - encode(field, wanted)
+            largest = np.abs(encode(field, wanted)).max()
+            if field.present:
+                there = np.asarray(self.beginning.states[field.present]).reshape(len(off), -1) > 0
+                off = off[there]
+        return float(np.abs(off).max(initial=0.0)), float(largest)
 
     def _breach(self, symmetry: Symmetry, turned: Episode) -> str:
         """What of `turned` is not as in the usual episode after `symmetry`; empty if nothing."""
         usual = self.beginning
-        for name, axes in symmetry.states.items():
-            wanted = permuted(np.asarray(usual.states[name], np.float64), axes)
-            error = np.abs(turned.states[name] - wanted).max()
-            differs = error > OFF * np.abs(wanted).max() + 1e-6
-            if differs and error > DOUBT * self._spread.get(name, 0.0):
-                return f"state {name!r} differs by {error:.2g}"
-        for name in symmetry.headings:
-            wanted = symmetry.of_states(name, np.asarray(usual.states[name], np.float64))
-            off = np.angle(np.exp(1j * (turned.states[name] - wanted)))[usual.states[name] != 0]
-            if off.size and np.abs(off).max() > OFF * np.pi:
-                return f"state {name!r} differs by {np.abs(off).max():.2g} rad"
+        for field in self.card.state:
+            if self.card.transforms(symmetry, field.name) and field.kind != "vector":
+                error, largest = self._error(field, symmetry, turned)
+                differs = error > OFF * largest + 1e-6
+                if differs and error > DOUBT * self._spread.get(field.name, 0.0):
+                    return f"state {field.name!r} differs by {error:.2g}"
         masks = symmetry.of_frames(usual.masks)
         colours = symmetry.of_frames(np.moveaxis(usual.video, -1, 1))
         unlike = np.abs(colours.astype(float) - np.moveaxis(turned.video, -1, 1)).mean(1) / 255
@@ -384,3 +420,8 @@ def digests_elsewhere(
 
 def _digests(make: Callable[[], Environment], spec: EpisodeSpec, frames: int) -> dict[str, str]:
     return simulate(make(), spec, frames=frames).digests()
+
+
+def _code(field: StateField, episode: Episode) -> NDArray[np.float64]:
+    """The values of a field, alike where the world is: ``[T, rows, E]``."""
+    return encode(field, np.asarray(episode.states[field.name], np.float64))

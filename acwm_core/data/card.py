@@ -9,7 +9,7 @@ import math
 import platform
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -203,10 +203,9 @@ def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
 
 def _recipe(card: DatasetCard) -> dict[str, Any]:
     """All values that determine the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
-    values = card.to_dict()
+    values = replace(card, environment=card.environment.recorded).to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
     if not values["shift"]:  # data from before there were shifts is the same data
         del values["shift"]
-    values["environment"].pop("symmetries", None)  # they say what could be made of the bytes
     return dict(flat_items(values))

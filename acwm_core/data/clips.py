@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from acwm_core.data.dataset import EpisodeDataset
+    from acwm_core.env.card import EnvironmentCard
     from acwm_core.env.symmetry import Symmetry
 
 
@@ -315,10 +316,20 @@ class Clips(ABC):
         rows = {"actions": window_actions(actions, start, frames)}
         if symmetry:
             rows["actions"] = symmetry.of_actions(rows["actions"])
-            fields = [symmetry.of_states(*each) for each in zip(self._fields, fields, strict=True)]
+            card = self.episodes.card.environment
+            pairs = zip(self._fields, fields, strict=True)
+            fields = [_transformed(card, symmetry, *pair) for pair in pairs]
         if fields:
             rows["states"] = window_states(np.concatenate(fields, 1), start, frames)
         return rows
+
+
+def _transformed(
+    card: EnvironmentCard, symmetry: Symmetry, name: str, values: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The values ``[T, S]`` of a field of the state, its axes side by side, after a symmetry."""
+    apart = values.reshape(len(values), *card.fields[name].shape)
+    return card.transformed(symmetry, name, apart).reshape(values.shape)
 
 
 class ClipDataset(Clips):

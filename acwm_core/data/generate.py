@@ -232,8 +232,7 @@ def fill(
         manifests: dict[Split, Manifest] = {s: Manifest(out / s) for s in wanted.splits}
         tasks = list(_missing_shards(out, wanted, source, manifests))
         splits = _in_order({**there.splits, **wanted.splits})
-        symmetries = wanted.environment.symmetries or there.environment.symmetries
-        environment = replace(there.environment, symmetries=symmetries)
+        environment = wanted.environment.completed_by(there.environment)
         joined = replace(there, environment=environment, splits=splits)
         if tasks:
             if differences:  # other versions matter only if shards are still to be made

@@ -5,19 +5,27 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.camera import Camera, Vec3
 from acwm_core.env.episode import Episode, Factor, plain_unit
+from acwm_core.env.state_field import StateField as StateField
+from acwm_core.env.state_field import check_scene
+from acwm_core.env.states import transform
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import ShapeError, expect
 
 ActionKind = Literal["absolute", "delta", "velocity", "torque"]
 """What an action commands: a position, a change of position, a speed, or a force or torque."""
+
+
+SCENE = ("camera", "light")
+"""What a card says of the scene beside its fields; cards from before there was such have none."""
 
 
 @dataclass(frozen=True)
@@ -62,26 +70,6 @@ class ActionSpec:
 
 
 @dataclass(frozen=True)
-class StateField:
-    """One named array of ground truth, recorded in every frame.
-
-    Attributes:
-        name: key in `Episode.states`.
-        shape: shape of one frame's value.
-        unit: e.g. ``"m"``; ``""`` for none.
-        description: one phrase, including the frame of reference if there is one.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    unit: str
-    description: str
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", plain_unit(self.unit))
-
-
-@dataclass(frozen=True)
 class EnvironmentCard:
     """What users, datasets and models need to know about an environment without running it.
 
@@ -103,9 +91,13 @@ class EnvironmentCard:
         views: names of the cameras, from left to right, if a frame shows several of equal width.
         symmetries: all that the environment has, see `acwm_core.env.symmetry.group`; without those
             that frames of this size cannot show.
+        camera: where positions are in the picture, at nominal factors. None if that is unknown.
+        light: direction in the world to the light, if shadows tell something of where things are.
 
     Raises:
         ShapeError: a symmetry takes another number of actions.
+        ShapeError: a field of the state names another field or an instance that is not there.
+        ShapeError: there is a camera, although frames show several views.
     """
 
     name: str
@@ -124,8 +116,17 @@ class EnvironmentCard:
     citation: str = ""
     views: tuple[str, ...] = ()
     symmetries: tuple[Symmetry, ...] = ()
+    camera: Camera | None = None
+    light: Vec3 | None = None
 
     def __post_init__(self) -> None:
+        check_scene(self.state, self.instances)
+        if self.views and self.camera:
+            raise ShapeError(f"frames of {self.name} show several views, which no one camera sees")
+        if self.light is not None and not (
+            len(self.light) == 3 and 0 < math.hypot(*self.light) < math.inf
+        ):
+            raise ShapeError(f"the light of {self.name} is a direction, not {list(self.light)}")
         object.__setattr__(self, "fps", plain_rate(self.fps))
         for symmetry in self.symmetries:
             if len(symmetry.actions) != self.action.size:
@@ -145,10 +146,62 @@ class EnvironmentCard:
             common += 1
         return tuple("".join(part[common:]) for part in parts)
 
+    @property
+    def fields(self) -> dict[str, StateField]:
+        """The fields of the state by their names."""
+        return {each.name: each for each in self.state}
+
+    @property
+    def recorded(self) -> EnvironmentCard:
+        """The card without what says what could be made of recorded data: symmetries and scene."""
+        plain = (StateField(f.name, f.shape, f.unit, f.description) for f in self.state)
+        return replace(self, state=tuple(plain), symmetries=(), camera=None, light=None)
+
+    def completed_by(self, other: EnvironmentCard) -> EnvironmentCard:
+        """The card with the symmetries and what else `other` says of the scene, if it says nothing.
+
+        Both are cards of the same recorded data.
+        """
+        own = {each.name: each for each in self.recorded.state}
+        fields = other.fields
+        state = (fields.get(f.name, f) if f == own[f.name] else f for f in self.state)
+        return replace(
+            self,
+            state=tuple(state),
+            symmetries=self.symmetries or other.symmetries,
+            camera=self.camera or other.camera,
+            light=self.light or other.light,
+        )
+
+    def contradictions(self, other: EnvironmentCard) -> list[str]:
+        """What both cards say of the scene, and not alike, e.g. ``["camera", "state yaw"]``."""
+        mine, theirs = self.completed_by(other), other.completed_by(self)
+        found = [name for name in SCENE if getattr(mine, name) != getattr(theirs, name)]
+        pairs = zip(mine.state, theirs.state, strict=False)
+        return found + [f"state {a.name}" for a, b in pairs if a != b and a.name == b.name]
+
+    def transformed(self, symmetry: Symmetry, name: str, values: NDArray[Any]) -> NDArray[Any]:
+        """The values `[T, …]` of a state field after a symmetry: as that says, or as the kind does.
+
+        Raises:
+            ShapeError: neither tells how the field is transformed.
+        """
+        if name in symmetry.states or name in symmetry.headings:
+            return symmetry.of_states(name, values)
+        return transform(self.fields[name], values, symmetry, self.camera)
+
+    def transforms(self, symmetry: Symmetry, name: str) -> bool:
+        """Whether it is known how a symmetry transforms a state field."""
+        try:
+            self.transformed(symmetry, name, np.zeros((1, *self.fields[name].shape)))
+        except ShapeError:
+            return False
+        return True
+
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
-        values = asdict(self)
-        newer = {name for name in ("views", "symmetries") if not values[name]}
+        values = {**asdict(self), "state": [each.to_dict() for each in self.state]}
+        newer = {name for name in ("views", "symmetries", *SCENE) if not values[name]}
         return {name: value for name, value in values.items() if name not in newer}
 
     @classmethod
@@ -161,6 +214,8 @@ class EnvironmentCard:
         values["episodes"] = dict(fields.get("episodes", {}))
         symmetries = fields.get("symmetries", ())
         values["symmetries"] = tuple(map(Symmetry.from_dict, symmetries))
+        if camera := fields.get("camera"):
+            values["camera"] = Camera.from_dict(camera)
         return cls(**values)
 
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors import PluginError, check_shape
+from acwm_core.env.state_field import SYMMETRIES, BodySymmetry, StateField
+from acwm_core.errors import PluginError, ShapeError, check_shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -51,36 +53,13 @@ estimated, e.g. the sizes of bodies and the positions of fixtures.
 """
 
 
-class ViewingCamera(Protocol):
-    """The camera at nominal factors: projects points into frames of any size, and back.
-
-    Frame coordinates are x to the right and y down, from the frame's centre, in frame heights.
-    """
-
-    def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project world points `[…, 3]` in m to frame coordinates and depth in m, `[…, 3]`."""
-        ...
-
-    def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `to_frame`."""
-        ...
-
-    def on_plane(self, seen: NDArray[np.float64], height: float) -> NDArray[np.float64]:
-        """Where rays through frame coordinates `[…, 2]` meet the plane z = `height`: `[…, 3]`."""
-        ...
-
-
-Symmetry = Literal["none", "half_turn", "quarter_turn", "box", "cube"]
-"""Rotations after which a body looks the same:
-
-* ``half_turn``, ``quarter_turn``: for an angle, rotations by π or π/2.
-* ``box``, ``cube``: for a quaternion, the 4 rotations of a box or the 24 of a cube.
-"""
+ReadingKind = Literal["position", "curve", "angle", "quaternion"]
+"""Kinds of state fields that can be read from video and compared."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A state field with positions or orientations of bodies.
+    """A state field with positions or orientations of bodies; see `readings_of`.
 
     Attributes:
         field: its name on the card.
@@ -94,9 +73,9 @@ class Reading:
     """
 
     field: str
-    kind: Literal["position", "curve", "angle", "quaternion"]
+    kind: ReadingKind
     instances: tuple[str, ...]
-    symmetry: Symmetry = "none"
+    symmetry: BodySymmetry = "none"
     present: str = ""
     columns: tuple[int, ...] = ()
 
@@ -104,6 +83,40 @@ class Reading:
         """Select its values `[T, …]` from the states of an observation or of the simulator."""
         values = np.asarray(states[self.field], np.float64)
         return values[..., list(self.columns)] if self.columns else values
+
+
+def readings_of(state: Iterable[StateField], *names: str) -> tuple[Reading, ...]:
+    """The positions and orientations in some fields of the state, as the card declares them.
+
+    Args:
+        state: the fields of the card.
+        names: of those that are read.
+
+    Raises:
+        ShapeError: a field is not there, or has nothing that can be read.
+    """
+    fields, readings = {each.name: each for each in state}, list[Reading]()
+    for name in names:
+        field, kinds = fields.get(name), get_args(ReadingKind)
+        parts = [part for part in field.parts if part.kind in kinds] if field else []
+        if field is None or not parts or not field.instances:
+            raise ShapeError(
+                f"{name!r} cannot be read: declare it as one of {', '.join(kinds)} and name its "
+                "instances"
+            )
+        owners = field.instances if field.grid else field.owners
+        readings += [
+            Reading(
+                name,
+                cast(ReadingKind, part.kind),
+                owners,
+                field.symmetry if part.kind in SYMMETRIES else "none",
+                field.present,
+                part.columns,
+            )
+            for part in parts
+        ]
+    return tuple(readings)
 
 
 @dataclass(frozen=True)
@@ -175,7 +188,8 @@ class Physics:
             many before it counts as real.
         unseen: number of consecutive frames for which an object may be out of sight, whatever
             hides it.
-        camera: the camera at nominal factors, for estimators that turn pixels into positions.
+        camera: that of the environment's card, for estimators that turn pixels into positions.
+        state: the fields of the card, for estimators that read some.
     """
 
     readings: tuple[Reading, ...] = ()
@@ -186,7 +200,13 @@ class Physics:
     gaps: tuple[Gap, ...] = ()
     lasting: int = 3
     unseen: float = math.inf
-    camera: ViewingCamera | None = None
+    camera: Camera | None = None
+    state: tuple[StateField, ...] = ()
+
+    @property
+    def fields(self) -> dict[str, StateField]:
+        """The fields of the card by their names."""
+        return {each.name: each for each in self.state}
 
     @property
     def positions(self) -> list[Reading]:

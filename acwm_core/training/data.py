@@ -69,11 +69,12 @@ class ClipData(L.LightningDataModule):
 
     def _check_states(self) -> None:
         """Refuse symmetries that do not say how they transform the states to learn."""
+        card = self.episodes.card.environment
         for name, symmetry in itertools.product(self.config.states, self._symmetries):
-            if name not in symmetry.states:
+            if name in card.fields and not card.transforms(symmetry, name):
                 raise DataError(
-                    f"data.states: the symmetry {symmetry.name} of {self.episodes.path} does not "
-                    f"say how it transforms {name}: leave out {name}, or data.symmetries"
+                    f"data.states: the card of {self.episodes.path} does not say how the symmetry "
+                    f"{symmetry.name} transforms {name}: leave out {name}, or data.symmetries"
                 )
 
     def state_scale(self) -> tuple[Tensor, Tensor]:

@@ -75,7 +75,11 @@ def checkpoint_to_resume(
         recipe = with_recorded_precision(recipe, before, last)
         before = with_recorded_precision(before, before, last)
     differences = recipe_differences(before, recipe)
-    differences += [f"dataset {d}" for d in DatasetCard.read(run.card).differences(card)]
+    there = DatasetCard.read(run.card)
+    other_data = [f"dataset {d}" for d in there.differences(card)]
+    scene = [] if other_data else there.environment.contradictions(card.environment)
+    differences += other_data
+    differences += [f"the dataset's card says otherwise of its {name} now" for name in scene]
     if differences:
         raise TrainingError(
             f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "

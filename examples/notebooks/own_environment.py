@@ -12,6 +12,7 @@
 import numpy as np
 from PIL import Image
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
 from acwm_core.env.episode import EpisodeSpec, Factor
 
@@ -42,11 +43,12 @@ CARD = EnvironmentCard(
     ),
     ood_shifts=("mass",),
     state=(
-        StateField("position", (2,), "m", "x right, y up"),
-        StateField("velocity", (2,), "m/s", "rate of change of the position"),
+        StateField("position", (2,), "m", "x right, y up", "position", ("puck",)),
+        StateField("velocity", (2,), "m/s", "rate of change of the position", "vector", ("puck",)),
     ),
     instances=("ice", "puck"),
     engine="numpy",
+    camera=Camera.flat(1.0),  # from -1 to 1, and so where positions are in the picture
 )
 
 # %% [markdown]

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_start import CELLS, NODES
-from acwm_deformable.physics import CLOTH_CAMERA
+from acwm_deformable.states import CLOTH_CAMERA, CLOTH_LIGHT
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, capsule, cylinder, join, plane
@@ -20,7 +20,7 @@ CAMERAS: dict[str, Camera] = {
 }
 
 LIGHTS: dict[str, Light] = {
-    "noon": Light(direction=(0.4, -0.75, 1.15), softness=0.012),
+    "noon": Light(direction=CLOTH_LIGHT, softness=0.012),
     "evening": Light(
         direction=(-1.0, -0.55, 0.9),
         sun=(0.92, 0.70, 0.48),

@@ -7,13 +7,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_core.env.symmetry import Symmetry
 from acwm_deformable.cloth import Cloth
 from acwm_deformable.cloth_drawing import CLOTH_ID, HAND_ID, SPHERE_ID, ClothDrawing
 from acwm_deformable.cloth_policy import Carrier, TwoArms
 from acwm_deformable.cloth_start import NODES, hang, sheet_of
+from acwm_deformable.states import (
+    CLOTH_CAMERA,
+    CLOTH_LIGHT,
+    CLOTH_MOVE_STATE,
+    GRIPPERS,
+    NODE_STRIDE,
+    VELOCITY_STRIDE,
+)
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 MAX_STEP = 0.06
@@ -21,8 +29,6 @@ MAX_STEP = 0.06
 
 GRASP, LET_GO = 0.5, -0.5
 """A grasp command above the first value closes a gripper; one below the second opens it."""
-
-_NODE_STRIDE, _VELOCITY_STRIDE = 2, 4
 
 _FACTORS = (
     Factor.continuous(
@@ -92,36 +98,8 @@ _LIMITS = {
 _MIRROR = Symmetry(
     (-1, 2, 3),
     mirrored=True,
-    states={
-        name: (-1, 2, 3)
-        for name in ("cloth_position", "cloth_velocity", "gripper_position", "sphere_position")
-    },
     repainted=("cloth",),  # its bright and its dark side change places
 )
-
-
-def _state_fields() -> tuple[StateField, ...]:
-    points, speeds = (len(range(0, NODES, s)) for s in (_NODE_STRIDE, _VELOCITY_STRIDE))
-    return (
-        StateField(
-            "cloth_position",
-            (points, points, 3),
-            "m",
-            f"every {_NODE_STRIDE}nd node of the {NODES} × {NODES} along each side, float16, in "
-            "the world (x right, y away, z up); the grippers first hold both ends of row 0",
-        ),
-        StateField(
-            "cloth_velocity",
-            (speeds, speeds, 3),
-            "m/s",
-            f"every {_VELOCITY_STRIDE}th node along each side, float16",
-        ),
-        StateField("cloth_size", (), "m", "side of the cloth at rest"),
-        StateField("gripper_position", (2, 3), "m", "middle of each gripper's jaws"),
-        StateField("gripper_holds", (2,), "", "1 for a gripper that holds the cloth"),
-        StateField("sphere_position", (3,), "m", "centre"),
-        StateField("sphere_radius", (), "m", "it does not move"),
-    )
 
 
 class ClothMove(SceneEnvironment[Cloth]):
@@ -150,13 +128,15 @@ class ClothMove(SceneEnvironment[Cloth]):
         horizon=64,
         factors=_FACTORS,
         ood_shifts=("cloth_size", "placement"),
-        state=_state_fields(),
-        instances=("ground", "sphere", "cloth", "gripper_1", "gripper_2"),
+        state=CLOTH_MOVE_STATE,
+        instances=("ground", "sphere", "cloth", *GRIPPERS),
         engine="Taichi (XPBD)",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         variants=("cloth_move_8d",),
         citation="ACWM-Phys, arXiv:2605.08567",
         symmetries=(_MIRROR,),
+        camera=CLOTH_CAMERA,
+        light=CLOTH_LIGHT,
     )
     together = True
     longest_step = MAX_STEP
@@ -186,8 +166,8 @@ class ClothMove(SceneEnvironment[Cloth]):
         nodes = cloth.nodes.reshape(NODES, NODES, 3)
         speeds = cloth.velocities.reshape(NODES, NODES, 3)
         return {
-            "cloth_position": nodes[::_NODE_STRIDE, ::_NODE_STRIDE].astype(np.float16),
-            "cloth_velocity": speeds[::_VELOCITY_STRIDE, ::_VELOCITY_STRIDE].astype(np.float16),
+            "cloth_position": nodes[::NODE_STRIDE, ::NODE_STRIDE].astype(np.float16),
+            "cloth_velocity": speeds[::VELOCITY_STRIDE, ::VELOCITY_STRIDE].astype(np.float16),
             "cloth_size": np.array(self._factors["cloth_size"], np.float32),
             "gripper_position": cloth.hands.copy(),
             "gripper_holds": (cloth.held >= 0).astype(np.float32),

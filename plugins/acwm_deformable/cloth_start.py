@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_deformable.cloth import ROOM, THICKNESS, Cloth, Sheet
+from acwm_deformable.states import CLOTH_NODES
 
-CELLS = 40
+NODES = CLOTH_NODES
+
+CELLS = NODES - 1
 """Number of edges along each side of the cloth."""
-
-NODES = CELLS + 1
 
 CORNERS = (0, CELLS)
 """The nodes that the grippers hold initially: both ends of the upper hem."""

@@ -6,27 +6,27 @@ from functools import partial
 
 import numpy as np
 
-from acwm_core.env.physics import Constant, Gap, Observation, Physics, Reading, States
-from acwm_sim.camera import Camera
+from acwm_core.env.physics import Constant, Gap, Observation, Physics, States, readings_of
+from acwm_deformable.states import (
+    CLOTH_CAMERA,
+    CLOTH_MOVE_STATE,
+    GRIPPERS,
+    PUSH_ROPE_STATE,
+    ROPE_CAMERA,
+    ROPE_RADIUS,
+)
 from acwm_sim.geometry import Array, distance, outer_radius, point_to_curve
 
-POLE_RADIUS, ROPE_RADIUS = 0.07, 0.035
-"""Metres; the rope's radius is the one for nominal factors."""
+POLE_RADIUS = 0.07  # metres
 
 HAND_RADIUS = 0.03
 """Radius of a gripper of cloth_move, metres."""
-
-ROPE_CAMERA = Camera(eye=(0.0, -2.2, 4.0), target=(0.0, -0.08, 0.0), fov=33.5)
-CLOTH_CAMERA = Camera(eye=(0.0, -2.15, 1.55), target=(0.0, 0.0, 0.33), fov=39)
-"""The cameras of push_rope and cloth_move with nominal factors."""
 
 ROPE_ID, SPHERE_ID = 1, 1
 """Instance ids of push_rope's rope and cloth_move's sphere."""
 
 COVERED = 30
 """Frames for which a rope must be too short, as the pole and the rope itself may cover parts."""
-
-_GRIPPERS = ("gripper_1", "gripper_2")
 
 
 def _length(seen: Observation, start: States) -> Array:
@@ -63,27 +63,26 @@ def _hand_to_sphere(k: int, seen: Observation, start: States) -> Array:
 
 
 PUSH_ROPE = Physics(
-    readings=(
-        Reading("rope_position", "curve", ("rope",)),
-        Reading("pole_position", "position", ("pole",)),
-    ),
+    readings=readings_of(PUSH_ROPE_STATE, "rope_position", "pole_position"),
     objects=("rope", "pole"),
     shapes=("rope",),
     constants=(Constant("length of the rope", "length", _length, lasting=COVERED),),
     gaps=(Gap("rope-pole", ("rope", "pole"), _pole_to_rope, touch=0.0, solid=0.0),),
     camera=ROPE_CAMERA,
+    state=PUSH_ROPE_STATE,
 )
 """The physics of a rope on a table and a pole."""
 
 CLOTH_MOVE = Physics(
-    readings=(Reading("gripper_position", "position", _GRIPPERS),),
+    readings=readings_of(CLOTH_MOVE_STATE, "gripper_position"),
     objects=("sphere", "cloth"),  # grippers hang on wires thinner than a pixel
     shapes=("cloth",),
     constants=(Constant("radius of the sphere", "length", _radius),),
     gaps=tuple(
         Gap("sphere-gripper", ("sphere", name), partial(_hand_to_sphere, k), touch=0.0, solid=0.0)
-        for k, name in enumerate(_GRIPPERS)
+        for k, name in enumerate(GRIPPERS)
     ),
     camera=CLOTH_CAMERA,
+    state=CLOTH_MOVE_STATE,
 )
 """The physics of a cloth carried by two grippers, and a sphere."""

@@ -6,14 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_core.env.symmetry import Symmetry
 from acwm_deformable.physics import POLE_RADIUS
-from acwm_deformable.rope import NODES, POLE_ROOM, Cord, Rope
+from acwm_deformable.rope import POLE_ROOM, Cord, Rope
 from acwm_deformable.rope_curves import lay_rope
 from acwm_deformable.rope_drawing import POLE_ID, ROPE_ID, RopeDrawing
 from acwm_deformable.rope_policy import Pusher
+from acwm_deformable.states import PUSH_ROPE_STATE, ROPE_CAMERA
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 MAX_STEP = 0.06
@@ -65,21 +66,7 @@ _LIMITS = {
 }
 """The factor values that the simulation accepts."""
 
-_STATE = (
-    StateField("rope_position", (NODES, 2), "m", "nodes from end to end; x right, y away"),
-    StateField("rope_velocity", (NODES, 2), "m/s", "velocity of every node"),
-    StateField("rope_length", (1,), "m", "sum of the distances between neighbouring nodes"),
-    StateField("pole_position", (2,), "m", "middle of the pole; x right, y away"),
-    StateField("pole_velocity", (2,), "m/s", "mean velocity of the pole since the last frame"),
-)
-
-_MIRROR = Symmetry(
-    (-1, 2),
-    mirrored=True,
-    states={
-        f"{what}_{how}": (-1, 2) for what in ("rope", "pole") for how in ("position", "velocity")
-    },
-)
+_MIRROR = Symmetry((-1, 2), mirrored=True)
 
 
 class PushRope(SceneEnvironment[Rope]):
@@ -107,12 +94,13 @@ class PushRope(SceneEnvironment[Rope]):
         horizon=64,
         factors=_FACTORS,
         ood_shifts=("length",),
-        state=_STATE,
+        state=PUSH_ROPE_STATE,
         instances=("table", "rope", "pole"),
         engine="Taichi (XPBD)",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
         symmetries=(_MIRROR,),
+        camera=ROPE_CAMERA,
     )
 
     longest_step = MAX_STEP

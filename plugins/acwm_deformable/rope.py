@@ -7,13 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from acwm_deformable.kernels import rope_solver as at
 from acwm_deformable.kernels.rope_solver import advance_rope
-from acwm_deformable.physics import POLE_RADIUS, ROPE_RADIUS
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.states import NODES, ROPE_RADIUS
 from acwm_sim import engine
 
 GRAVITY = 9.81
-
-NODES = 80
-"""Number of nodes of every rope, regardless of its length."""
 
 DENSITY = 1.5
 """Mass per length, kg/m."""

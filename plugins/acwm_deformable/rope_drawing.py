@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_deformable.physics import POLE_RADIUS, ROPE_CAMERA
-from acwm_deformable.rope import NODES, Cord, Rope
+from acwm_deformable.physics import POLE_RADIUS
+from acwm_deformable.rope import Cord, Rope
+from acwm_deformable.states import NODES, POLE_HALF, ROPE_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, cylinder, plane
@@ -39,7 +40,6 @@ _STRIPE = 0.1  # metres
 _STRIPES = round(MAX_LENGTH / _STRIPE)
 _RINGS, _AROUND = 4, 7  # vertices along a stripe and around it
 _CAP = 3  # additional rings that round off an end of the rope
-_POLE_HALF = 0.16  # half height, metres
 
 
 class RopeDrawing(Drawing[Rope]):
@@ -53,7 +53,7 @@ class RopeDrawing(Drawing[Rope]):
     def _build(self) -> None:
         """Add the table, the pole, and the stripes of a rope, which `draw` places later."""
         self.scene.add_mesh(plane(4.0, 20, _TILES), static=True, gloss=0.0)
-        pole = cylinder(POLE_RADIUS, _POLE_HALF, 0.008)
+        pole = cylinder(POLE_RADIUS, POLE_HALF, 0.008)
         self.scene.add_mesh(pole, instance=POLE_ID, gloss=0.15)
         for _ in range(_STRIPES):
             self.scene.add_mesh(_stripe(), instance=ROPE_ID, gloss=0.06)
@@ -68,7 +68,7 @@ class RopeDrawing(Drawing[Rope]):
 
     def draw(self, simulation: Rope) -> Frame:
         places, turns = np.zeros((1 + _STRIPES, 3)), np.tile(np.eye(3), (1 + _STRIPES, 1, 1))
-        places[0] = (*simulation.pole, _POLE_HALF)
+        places[0] = (*simulation.pole, POLE_HALF)
         surface = zip(*self._tube.around(simulation.nodes), strict=True)
         for k, (vertices, normals) in enumerate(surface):
             self.scene.set_vertices(1 + k, vertices, normals)

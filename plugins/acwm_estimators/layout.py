@@ -1,17 +1,20 @@
 """What is read from an environment, and how: the layout of a network's outputs.
 
-Each network that ships has its layout here, under the name of its weights. The environment itself
-defines the scene: its camera and what can be measured in it.
+Each network that ships has its layout here, under the name of its weights. Where things are, whose
+they are and which turns look the same is on the environment's card.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Literal
 
-from acwm_core.env.physics import ViewingCamera
+from acwm_core.env.camera import Camera
+from acwm_core.env.physics import Physics
+from acwm_core.env.rotations import FOLDS
+from acwm_core.env.state_field import SYMMETRIES
 from acwm_core.errors import PluginError
 from acwm_estimators.limits import ideal_physics_of
 from acwm_estimators.plugin import WEIGHTS
@@ -133,7 +136,7 @@ class Layout:
         curves: bodies that are traced through masks.
     """
 
-    camera: ViewingCamera
+    camera: Camera
     instances: tuple[str, ...]
     points: tuple[Points, ...]
     locals: tuple[Local, ...] = ()
@@ -150,84 +153,124 @@ def layout_of(environment: str) -> Layout:
         KeyError: no weights ship for the environment.
         PluginError: the environment's physics has no camera.
     """
-    camera = ideal_physics_of(environment).camera
-    if camera is None:
-        raise PluginError(f"the physics of environment {environment!r} names no camera")
-    return LAYOUTS[WEIGHTS[environment]](camera)
+    return LAYOUTS[WEIGHTS[environment]](ideal_physics_of(environment))
 
 
-_CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
-_POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
-_GRIPPERS = ("gripper_1", "gripper_2")
+def _camera(physics: Physics) -> Camera:
+    if physics.camera is None:
+        raise PluginError("the physics of this environment names no camera")
+    return physics.camera
 
 
-def _push_cube(camera: ViewingCamera, pushers: tuple[str, ...] = ("pusher",)) -> Layout:
-    return Layout(
-        camera,
-        ("wall", *pushers, *_CUBES),
-        (Points("pusher_position", pushers, plane=0.05), Points("cube_position", _CUBES)),
-        (Local("cube_yaw", "cube_position", len(_CUBES), "angle", fold=4, whole=True),),
+def _points(physics: Physics, name: str, *instances: str) -> Points:
+    """The positions in a field, with its own instances or those in whose pixels they are read."""
+    field = physics.fields[name]
+    plane = field.height if field.shape[-1] == 2 else None
+    return Points(name, instances or field.owners, plane)
+
+
+def _turns(physics: Physics, name: str, under: str) -> Local:
+    """The angles or quaternions in a field, one for each row of `under`."""
+    field = physics.fields[name]
+    (part,) = (part for part in field.parts if part.kind in SYMMETRIES)
+    encoding: Encoding = "axes" if field.symmetry == "box" else "yaw"
+    return Local(
+        name,
+        under,
+        field.rows,
+        "angle" if part.kind == "angle" else encoding,
+        FOLDS[field.symmetry],
+        part.columns[0] if part.columns else None,
+        whole=True,
     )
 
 
-LAYOUTS: dict[str, Callable[[ViewingCamera], Layout]] = {
-    "push_cube": _push_cube,
-    "push_cube_two_pushers": partial(_push_cube, pushers=("pusher_1", "pusher_2")),
-    "stack_cube": partial(
-        Layout,
-        instances=("arm", "gripper", "red_cube", "green_cube"),
-        points=(
-            Points("hand_position", ("gripper",)),
-            Points("cube_position", ("red_cube", "green_cube")),
-        ),
-        locals=(
+def _push_cube(physics: Physics) -> Layout:
+    pushers, cubes = (_points(physics, f"{who}_position") for who in ("pusher", "cube"))
+    return Layout(
+        _camera(physics),
+        ("wall", *pushers.instances, *cubes.instances),
+        (pushers, cubes),
+        (_turns(physics, "cube_yaw", "cube_position"),),
+    )
+
+
+def _stack_cube(physics: Physics) -> Layout:
+    return Layout(
+        _camera(physics),
+        ("arm", "gripper", "red_cube", "green_cube"),
+        (_points(physics, "hand_position"), _points(physics, "cube_position")),
+        (
             Local("gripper_opening", "hand_position", 1),
-            Local("cube_quaternion", "cube_position", 2, "yaw", fold=4, whole=True),
+            _turns(physics, "cube_quaternion", "cube_position"),
         ),
-    ),
-    "push_rope": partial(
-        Layout,
-        instances=("rope", "pole"),
-        points=(Points("pole_position", ("pole",), plane=0.16),),
-        curves=(Curve("rope_position", "rope_length", "rope", "pole", plane=0.035, end=0.035),),
-    ),
-    "cloth_move": partial(
-        Layout,
-        instances=("sphere", "cloth", *_GRIPPERS),
-        points=(Points("gripper_position", _GRIPPERS), Points("sphere_position", ("sphere",))),
-    ),
-    "push_sand": partial(
-        Layout,
-        instances=("sand", "board"),
-        points=(Points("board_position", ("board",)),),
-        locals=(Local("board_quaternion", "board_position", 1, "axes", whole=True),),
+    )
+
+
+def _push_rope(physics: Physics) -> Layout:
+    rope = physics.fields["rope_position"]
+    curve = Curve(rope.name, "rope_length", "rope", "pole", plane=rope.height, end=0.035)
+    return Layout(
+        _camera(physics), ("rope", "pole"), (_points(physics, "pole_position"),), curves=(curve,)
+    )
+
+
+def _cloth_move(physics: Physics) -> Layout:
+    hands, sphere = (_points(physics, f"{who}_position") for who in ("gripper", "sphere"))
+    return Layout(_camera(physics), ("sphere", "cloth", *hands.instances), (hands, sphere))
+
+
+def _push_sand(physics: Physics) -> Layout:
+    return Layout(
+        _camera(physics),
+        ("sand", "board"),
+        (_points(physics, "board_position"),),
+        (_turns(physics, "board_quaternion", "board_position"),),
         totals=("grain_count",),
         surface=Surface("sand_height", (24, 40), (0.48, 0.80), 0.03),
-    ),
-    "pour_water": partial(
-        Layout,
-        instances=("cup", "container", "water", "holder"),
-        points=(Points("cup_pose", ("cup",)), Points("container_position", ("container",))),
-        locals=(Local("cup_pose", "cup_pose", 1, "angle", column=3, whole=True),),
+    )
+
+
+def _pour_water(physics: Physics) -> Layout:
+    return Layout(
+        _camera(physics),
+        ("cup", "container", "water", "holder"),
+        (_points(physics, "cup_pose"), _points(physics, "container_position")),
+        (_turns(physics, "cup_pose", "cup_pose"),),
         totals=("water_cup", "water_container", "water_spilled", "water_air"),
-    ),
-    "robot_arm": partial(
-        Layout,
-        instances=("table", "arm", "gripper", *_POSTS),
-        points=(
-            Points("link_position", ("arm",) * 7 + ("gripper",)),
-            Points("hand_position", ("gripper",)),
-            Points("obstacle_position", _POSTS),
+    )
+
+
+def _robot_arm(physics: Physics) -> Layout:
+    links, hand, posts = (
+        _points(physics, f"{what}_position") for what in ("link", "hand", "obstacle")
+    )
+    return Layout(
+        _camera(physics), ("table", "arm", "gripper", *posts.instances), (links, hand, posts)
+    )
+
+
+def _reacher(physics: Physics) -> Layout:
+    return Layout(
+        _camera(physics),
+        ("wall", "base", "upper_arm", "forearm", "fingertip", "goal"),
+        (
+            _points(physics, "elbow_position", "forearm"),
+            _points(physics, "fingertip_position"),
+            _points(physics, "goal_position"),
         ),
-    ),
-    "reacher": partial(
-        Layout,
-        instances=("wall", "base", "upper_arm", "forearm", "fingertip", "goal"),
-        points=(
-            Points("elbow_position", ("forearm",), plane=0.198),
-            Points("fingertip_position", ("forearm",), plane=0.198),
-            Points("goal_position", ("goal",), plane=0.0),
-        ),
-    ),
+    )
+
+
+LAYOUTS: dict[str, Callable[[Physics], Layout]] = {
+    "push_cube": _push_cube,
+    "push_cube_two_pushers": _push_cube,
+    "stack_cube": _stack_cube,
+    "push_rope": _push_rope,
+    "cloth_move": _cloth_move,
+    "push_sand": _push_sand,
+    "pour_water": _pour_water,
+    "robot_arm": _robot_arm,
+    "reacher": _reacher,
 }
 """Layouts by the name of the weights."""

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.rotations import angle_of_code, rotation_of_code
 from acwm_estimators.curve import same_end_first
 from acwm_estimators.layout import Curve, Layout, Local, Points
 from acwm_estimators.targets import MIN_SEEN, points_there
-from acwm_estimators.turns import decode_angle, decode_axes, upright
+from acwm_estimators.turns import upright
 
 Array = NDArray[np.float64]
 
@@ -62,8 +63,8 @@ def decoded(codes: Array, local: Local) -> Array:
     if local.encoding == "value":
         return codes[..., 0].copy()
     if local.encoding == "axes":
-        return decode_axes(codes)
-    angles = decode_angle(codes, local.fold)
+        return rotation_of_code(codes, "box")
+    angles = angle_of_code(codes, local.fold)
     return upright(angles) if local.encoding == "yaw" else angles
 
 

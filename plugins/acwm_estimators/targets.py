@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.physics import ViewingCamera
+from acwm_core.env.rotations import angle_code, rotation_code
 from acwm_estimators.layout import Layout, Local, Points
-from acwm_estimators.turns import encode_angle, encode_axes, heading
+from acwm_estimators.turns import heading
 
 MIN_SEEN = 0.0006
 """Share of the frame that an instance must cover for its position to be read: over 2 pixels at a
@@ -36,7 +37,7 @@ def lifted(values: Array, plane: float | None) -> Array:
     return np.concatenate([values, np.full_like(values[..., :1], plane)], axis=-1)
 
 
-def seen_points(states: States, points: Points, camera: ViewingCamera) -> Array:
+def seen_points(states: States, points: Points, camera: Camera) -> Array:
     """Frame coordinates and depth `[T, rows, 3]`."""
     return camera.to_frame(lifted(rows_of(states[points.field], points), points.plane))
 
@@ -58,11 +59,11 @@ def local_codes(states: States, local: Local) -> Array:
     if local.encoding == "value":
         return values.reshape(len(values), local.count, 1)
     if local.encoding == "angle":
-        return encode_angle(values.reshape(len(values), local.count), local.fold)
+        return angle_code(values.reshape(len(values), local.count), local.fold)
     values = values.reshape(len(values), local.count, 4)
     if local.encoding == "yaw":
-        return encode_angle(heading(values), local.fold)
-    return encode_axes(values)
+        return angle_code(heading(values), local.fold)
+    return rotation_code(values, "box")
 
 
 def totals_of(states: States, names: tuple[str, ...]) -> Array:

@@ -15,6 +15,7 @@ from acwm_core.data.card import DatasetCard, package_versions
 from acwm_core.env.card import ActionSpec, plain_rate
 from acwm_core.env.environment import EnvironmentCard, StateField
 from acwm_core.env.episode import SPLITS, Split
+from acwm_core.env.state_field import without_dangling
 from acwm_formats.alignment import Alignment
 from acwm_formats.bounds import action_bounds, beyond, outliers
 from acwm_formats.reading import ImportOptions, Reading, Scan
@@ -50,7 +51,7 @@ def recorded_card(
         horizon=horizon,
         factors=(),
         ood_shifts=(),
-        state=tuple(state),
+        state=without_dangling(state, instances),
         instances=instances or ("unlabelled",),  # every pixel of such masks has id 0
         engine=engine,
         citation=citation,

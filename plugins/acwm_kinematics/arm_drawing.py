@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from acwm_kinematics.arm_layout import GOALS
 from acwm_kinematics.arm_simulation import TABLE, TABLE_CENTER, ArmSimulation, Post
-from acwm_kinematics.physics import ARM_CAMERA
+from acwm_kinematics.states import ARM_CAMERA, ARM_LIGHT, GOALS, MAX_POSTS
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, cylinder, join, plane
@@ -25,7 +24,7 @@ _ROOM = (0.20, 0.21, 0.235)  # background colour
 
 LIGHTS: dict[str, Light] = {
     "noon": Light(
-        direction=(0.45, -0.55, 1.2),
+        direction=ARM_LIGHT,
         sun=(0.86, 0.84, 0.80),
         sky=(0.36, 0.38, 0.43),
         softness=0.008,
@@ -52,7 +51,6 @@ PALETTES: dict[str, tuple[Vec3, ...]] = {
 WAITING, MET = (0.93, 0.14, 0.18), (0.24, 0.82, 0.34)
 """Colours of a goal before and after the hand has reached it."""
 
-MAX_POSTS = 4
 
 GOAL_RADIUS = 0.025
 """Radius of a drawn goal in metres."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from acwm_kinematics.arm_planner import Clearance, Joints
 from acwm_kinematics.arm_simulation import Post
 from acwm_kinematics.physics import REACHED
+from acwm_kinematics.states import GOALS
 from acwm_sim.geometry import rotations
 from acwm_sim.panda import LOWER, UPPER
 
@@ -22,8 +23,6 @@ CENTRAL = np.array([[0.30, -0.42, 0.08], [0.66, 0.28, 0.46]])
 
 EXPANDED = np.array([[0.05, -0.66, 0.05], [0.76, 0.62, 0.72]])
 """Corners of the box of out-of-distribution goals; these goals lie outside `CENTRAL`."""
-
-GOALS = 3
 
 APART = 0.16
 """Least distance in metres of goals from each other and from the hand's first position."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task
-from acwm_kinematics.physics import POSTS, axis_to_post
+from acwm_kinematics.physics import axis_to_post
+from acwm_kinematics.states import POST_NAMES
 
 if TYPE_CHECKING:
     from acwm_kinematics.robot_arm import RobotArm
@@ -29,7 +30,7 @@ class Reach(Task):
     unit = "m"
     tolerance = 0.03
     max_steps = 63
-    avoid = tuple((part, post) for post in POSTS for part in ("arm", "gripper"))
+    avoid = tuple((part, post) for post in POST_NAMES for part in ("arm", "gripper"))
     # A gradient bends short motions around posts, where random blocks are motions that the data
     # does not have. Longer plans are further from what the model knows.
     planning = (
@@ -52,7 +53,7 @@ class Reach(Task):
 
     def failed(self, seen: Observation, goal: Goal) -> NDArray[np.bool_]:
         """Whether the axis of the arm is inside a post."""
-        depths = [axis_to_post(k, seen, goal.state) for k in range(len(POSTS))]
+        depths = [axis_to_post(k, seen, goal.state) for k in range(len(POST_NAMES))]
         return np.any(np.stack(depths) < 0, axis=0)
 
     def solution(self, environment: Environment, goal: Goal, rng: np.random.Generator) -> Policy:

@@ -6,13 +6,16 @@ from functools import partial
 
 import numpy as np
 
-from acwm_core.env.physics import Constant, Gap, Observation, Physics, Reading, States
-from acwm_sim.camera import Camera
+from acwm_core.env.physics import Constant, Gap, Observation, Physics, States, readings_of
+from acwm_kinematics.states import (
+    ARM_CAMERA,
+    GOAL_NAMES,
+    POST_NAMES,
+    REACHER_CAMERA,
+    REACHER_STATE,
+    ROBOT_ARM_STATE,
+)
 from acwm_sim.geometry import Array, distance, points_to_post
-
-ARM_CAMERA = Camera(eye=(1.62, -1.02, 1.15), target=(0.24, -0.04, 0.37), fov=42)
-REACHER_CAMERA = Camera(eye=(0.0, -1.5, 3.4), target=(0.0, -0.06, 0.0), fov=40.5)
-"""The cameras of robot_arm and reacher with nominal factors."""
 
 REACHED = 0.02
 """Distance in metres at which robot_arm's grasping point counts as at a goal."""
@@ -22,9 +25,6 @@ LIMB_RADIUS = 0.045
 
 MARKER_RADIUS = 0.1
 """Radius of reacher's goal marker, metres."""
-
-POSTS = ("obstacle_1", "obstacle_2", "obstacle_3", "obstacle_4")
-_GOALS = ("goal_1", "goal_2", "goal_3")
 
 _FIXED = {"upper arm": (1, 2), "forearm": (3, 4)}
 """Rows of robot_arm's `link_position` with a fixed distance, for the two long links."""
@@ -73,11 +73,8 @@ def _tip_to_goal(seen: Observation, start: States) -> Array:
 
 
 ROBOT_ARM = Physics(
-    readings=(
-        Reading("link_position", "position", ("arm",) * 7 + ("gripper",)),
-        Reading("hand_position", "position", ("gripper",)),
-    ),
-    objects=("arm", "gripper", *POSTS),
+    readings=readings_of(ROBOT_ARM_STATE, "link_position", "hand_position"),
+    objects=("arm", "gripper", *POST_NAMES),
     constants=tuple(
         Constant(f"length of the {name}", "length", partial(_link, *ends))
         for name, ends in _FIXED.items()
@@ -85,23 +82,20 @@ ROBOT_ARM = Physics(
     gaps=(
         *(
             Gap("hand-goal", ("gripper", name), partial(_hand_to_goal, k), touch=0.0)
-            for k, name in enumerate(_GOALS)
+            for k, name in enumerate(GOAL_NAMES)
         ),
         *(
             Gap("arm-post", ("arm", name), partial(_arm_to_post, k), solid=0.0)
-            for k, name in enumerate(POSTS)
+            for k, name in enumerate(POST_NAMES)
         ),
     ),
     camera=ARM_CAMERA,
+    state=ROBOT_ARM_STATE,
 )
 """The physics of a robot among posts, with goals in the air for its hand."""
 
 REACHER = Physics(
-    readings=(
-        Reading("elbow_position", "position", ("upper_arm",)),
-        Reading("fingertip_position", "position", ("forearm",)),  # its end
-        Reading("joint_angle", "angle", ("upper_arm", "forearm")),
-    ),
+    readings=readings_of(REACHER_STATE, "elbow_position", "fingertip_position", "joint_angle"),
     objects=("base", "upper_arm", "forearm", "fingertip", "goal"),
     constants=(
         Constant("length of the upper arm", "length", _upper_arm),
@@ -109,5 +103,6 @@ REACHER = Physics(
     ),
     gaps=(Gap("tip-goal", ("fingertip", "goal"), _tip_to_goal, touch=0.0),),
     camera=REACHER_CAMERA,
+    state=REACHER_STATE,
 )
 """The physics of a two-link arm in a plane and a flat marker."""

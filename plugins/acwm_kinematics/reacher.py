@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import RecipeError
@@ -19,6 +19,7 @@ from acwm_kinematics.reacher_drawing import (
     ReacherDrawing,
 )
 from acwm_kinematics.reacher_policy import Reacher, Region
+from acwm_kinematics.states import REACHER_CAMERA, REACHER_STATE
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 LIMITS = {"central": (-3.3, 3.5), "corner": (-3.7, 4.2)}
@@ -67,26 +68,7 @@ _FACTORS = (
     appearance("camera", "where the scene is seen from", "front", "top", "corner"),
 )
 
-_STATE = (
-    StateField("joint_angle", (2,), "rad", "shoulder from +x, elbow from the upper arm; [-π, π]"),
-    StateField("joint_velocity", (2,), "rad/s", "shoulder and elbow"),
-    StateField("elbow_position", (2,), "m", "from the shoulder, x right and y away"),
-    StateField("fingertip_position", (2,), "m", "from the shoulder, x right and y away"),
-    StateField("fingertip_velocity", (2,), "m/s", "velocity of the fingertip"),
-    StateField("goal_position", (2,), "m", "middle of the marker, from the shoulder"),
-)
-
-_MIRROR = Symmetry(
-    (-1, -2),
-    mirrored=True,
-    states={
-        "joint_velocity": (-1, -2),
-        "elbow_position": (-1, 2),
-        "fingertip_position": (-1, 2),
-        "fingertip_velocity": (-1, 2),
-        "goal_position": (-1, 2),
-    },
-)
+_MIRROR = Symmetry((-1, -2), mirrored=True, states={"joint_velocity": (-1, -2)})
 
 
 class ReacherArm(SceneEnvironment[Arm]):
@@ -114,12 +96,13 @@ class ReacherArm(SceneEnvironment[Arm]):
         horizon=50,
         factors=_FACTORS,
         ood_shifts=("goal",),
-        state=_STATE,
+        state=REACHER_STATE,
         instances=("floor", "wall", "base", "upper_arm", "forearm", "fingertip", "goal"),
         engine="MuJoCo",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
         symmetries=(_MIRROR,),
+        camera=REACHER_CAMERA,
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Arm:

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from acwm_kinematics.physics import MARKER_RADIUS, REACHER_CAMERA
+from acwm_kinematics.physics import MARKER_RADIUS
 from acwm_kinematics.reacher_arm import LINK_RADIUS, Arm
+from acwm_kinematics.states import FOREARM_HEIGHT, REACHER_CAMERA
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, cylinder, frame_of_boxes, join, plane
@@ -36,10 +37,10 @@ COLORS: dict[str, tuple[Vec3, Vec3, Vec3]] = {
 _DARK, _WHITE, _WOOD = (0.17, 0.18, 0.20), (0.97, 0.96, 0.94), (0.62, 0.50, 0.38)
 _TILES = ((0.93, 0.92, 0.90), (0.885, 0.875, 0.855))
 _WALL, _WALL_HEIGHT = 0.04, 0.10  # half thickness and height, metres
-_THICK, _GAP = 0.03, 0.008  # half thickness of a link; gap between the two
+_THICK = 0.03  # half thickness of a link; between the two is a gap of 8 mm
 _PIN = 0.03  # radius of the pins in the joints and of the fingertip
+_FORE_Z = FOREARM_HEIGHT
 _UPPER_Z = 0.13  # height of the middle of the upper arm
-_FORE_Z = _UPPER_Z + 2 * _THICK + _GAP
 _UPPER, _FORE, _CAP, _TIP, _RINGS, _WHITE_RING = range(6)  # moving parts
 
 

@@ -7,21 +7,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_core.errors import RecipeError
 from acwm_kinematics.arm_drawing import (
     ARM_ID,
     FIRST_POST_ID,
     GRIPPER_ID,
-    MAX_POSTS,
     TABLE_ID,
     ArmDrawing,
 )
-from acwm_kinematics.arm_layout import GOALS, Layout, Workspace, draw_layout
+from acwm_kinematics.arm_layout import Layout, Workspace, draw_layout
 from acwm_kinematics.arm_planner import Joints
 from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
+from acwm_kinematics.states import (
+    ARM_CAMERA,
+    ARM_LIGHT,
+    GOAL_NAMES,
+    GOALS,
+    MAX_POSTS,
+    POST_NAMES,
+    ROBOT_ARM_STATE,
+)
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 _MAX_HEIGHT = 0.6
@@ -75,21 +83,6 @@ _FACTORS = (
 
 _JOINTS = tuple(f"delta_joint_{k}" for k in range(1, 8))
 
-_STATE = (
-    StateField("joint_position", (7,), "rad", "angles of the arm's joints"),
-    StateField("joint_velocity", (7,), "rad/s", "of the arm's joints"),
-    StateField("joint_target", (7,), "rad", "angles that the servos are told to hold"),
-    StateField("link_position", (8, 3), "m", "origins of the frames of links 1 to 7 and the hand"),
-    StateField("hand_position", (3,), "m", "grasping point; the robot's base is the origin, z up"),
-    StateField("hand_quaternion", (4,), "", "orientation of the hand (w, x, y, z)"),
-    StateField("hand_velocity", (3,), "m/s", "velocity of the grasping point"),
-    StateField("goal_position", (GOALS, 3), "m", "goals, in the order of the behaviour's tour"),
-    StateField("goal_reached", (GOALS,), "", "1 once the grasping point has been at the goal"),
-    StateField("obstacle_present", (MAX_POSTS,), "", "1 for a post that is there; others are zero"),
-    StateField("obstacle_position", (MAX_POSTS, 3), "m", "centre of a post"),
-    StateField("obstacle_size", (MAX_POSTS, 2), "m", "radius (or half width) and height of a post"),
-)
-
 
 class RobotArm(SceneEnvironment[ArmSimulation]):
     """A Franka Panda at a table with posts, and goals in the air for its hand to visit.
@@ -116,18 +109,20 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         horizon=64,
         factors=_FACTORS,
         ood_shifts=("workspace",),
-        state=_STATE,
+        state=ROBOT_ARM_STATE,
         instances=(
             "floor",
             "table",
             "arm",
             "gripper",
-            *(f"obstacle_{k + 1}" for k in range(MAX_POSTS)),
-            *(f"goal_{k + 1}" for k in range(GOALS)),
+            *POST_NAMES,
+            *GOAL_NAMES,
         ),
         engine="PyBullet",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        camera=ARM_CAMERA,
+        light=ARM_LIGHT,
     )
 
     _layout: Layout | None = None

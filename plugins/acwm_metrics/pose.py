@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
-from functools import cache
-
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.physics import Physics, Reading, Symmetry
+from acwm_core.env.physics import Physics, Reading
+from acwm_core.env.rotations import FOLDS, product, rotations_of
+from acwm_core.env.state_field import BodySymmetry
 from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means
 from acwm_metrics.seen import exist, held_of, seen_of, share_found, shown
-
-PERIODS = {"none": 2 * np.pi, "half_turn": np.pi, "quarter_turn": np.pi / 2}
-"""Period of an angle by symmetry, in rad."""
 
 LARGEST = {
     "none": np.pi,
@@ -126,15 +122,15 @@ def _turned(prediction: Prediction, reading: Reading) -> NDArray[np.float64]:
 
 
 def angle_between(
-    first: NDArray[np.floating], second: NDArray[np.floating], symmetry: Symmetry
+    first: NDArray[np.floating], second: NDArray[np.floating], symmetry: BodySymmetry
 ) -> NDArray[np.float64]:
     """The smaller angle between two angles, in [0, period / 2] rad."""
-    period = PERIODS[symmetry]
+    period = 2 * np.pi / FOLDS[symmetry]
     return np.abs((np.asarray(first, np.float64) - second + period / 2) % period - period / 2)
 
 
 def turn_between(
-    first: NDArray[np.floating], second: NDArray[np.floating], symmetry: Symmetry
+    first: NDArray[np.floating], second: NDArray[np.floating], symmetry: BodySymmetry
 ) -> NDArray[np.float64]:
     """The smallest rotation angle from one orientation to any that looks like the other.
 
@@ -152,47 +148,3 @@ def turn_between(
     same = product(unit[0][..., None, :], rotations_of(symmetry))
     cosines = np.abs((same * unit[1][..., None, :]).sum(-1)).max(-1)
     return 2 * np.arccos(np.clip(cosines, 0, 1))
-
-
-def product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The quaternion product a b, `[…, 4]`: rotate by b, then by a."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
-    )
-
-
-@cache
-def rotations_of(symmetry: Symmetry) -> NDArray[np.float64]:
-    """The rotations `[n, 4]` after which a body looks the same.
-
-    Raises:
-        ValueError: it is a symmetry of angles, not of orientations.
-    """
-    if symmetry == "none":
-        return np.array([[1.0, 0, 0, 0]])
-    if symmetry == "box":
-        return np.eye(4)
-    if symmetry == "cube":
-        return np.array(sorted(_cube()))
-    raise ValueError(f"{symmetry} is the symmetry of an angle, not of an orientation")
-
-
-def _cube() -> set[tuple[float, ...]]:
-    """The 24 rotations of a cube; q and −q are the same rotation, and only one is included."""
-    half = np.sqrt(0.5)
-    found = [tuple(row) for row in np.eye(4)]
-    for pair in itertools.combinations(range(4), 2):
-        for sign in (half, -half):
-            row = np.zeros(4)
-            row[pair[0]], row[pair[1]] = half, sign
-            found.append(tuple(row))
-    found += [(0.5, *signs) for signs in itertools.product((0.5, -0.5), repeat=3)]
-    return {tuple(float(x) for x in row) for row in found}

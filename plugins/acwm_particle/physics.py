@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from acwm_core.env.physics import Constant, Gap, Level, Observation, Physics, Reading, States
+from acwm_core.env.physics import (
+    Constant,
+    Gap,
+    Level,
+    Observation,
+    Physics,
+    States,
+    readings_of,
+)
 from acwm_particle.cup import THICKNESS, Vessel
-from acwm_sim.camera import Camera
+from acwm_particle.states import POUR_WATER_STATE, PUSH_SAND_STATE, SAND_CAMERA, WATER_CAMERA
 from acwm_sim.geometry import Array, axes_of_quaternion, points_to_post
 
 BOARD = (0.010, 0.15, 0.075)
@@ -20,10 +28,6 @@ CUP, CONTAINER = Vessel(inner=0.46, tall=1.2), Vessel(inner=0.68, tall=0.8)
 
 SPACING = 0.06
 """Distance in metres between particles of water at rest; each represents a cube of this side."""
-
-SAND_CAMERA = Camera(eye=(0.0, -1.02, 0.86), target=(0.0, -0.045, 0.0), fov=38)
-WATER_CAMERA = Camera(eye=(-0.2, -5.2, 2.35), target=(-0.2, 0.0, 0.95), fov=37)
-"""The cameras of push_sand and pour_water with nominal factors."""
 
 SETTLED = 30
 """Frames for which less sand or water must be seen, as streams and splashes are misread briefly."""
@@ -93,25 +97,19 @@ def _cup_to_container(seen: Observation, start: States) -> Array:
 
 
 PUSH_SAND = Physics(
-    readings=(
-        Reading("board_position", "position", ("board",)),
-        Reading("board_quaternion", "quaternion", ("board",), "box"),
-    ),
+    readings=readings_of(PUSH_SAND_STATE, "board_position", "board_quaternion"),
     objects=("board",),
     shapes=("sand",),
     levels=(Level("sand", _sand_heights),),
     constants=(Constant("amount of sand", "amount", _grains, lasting=SETTLED),),
     gaps=(Gap("sand-board", ("sand", "board"), _board_to_sand, touch=0.0),),
     camera=SAND_CAMERA,
+    state=PUSH_SAND_STATE,
 )
 """The physics of sand and a board."""
 
 POUR_WATER = Physics(
-    readings=(
-        Reading("cup_pose", "position", ("cup",), columns=(0, 1, 2)),
-        Reading("container_position", "position", ("container",)),
-        Reading("cup_pose", "angle", ("cup",), columns=(3,)),
-    ),
+    readings=readings_of(POUR_WATER_STATE, "cup_pose", "container_position"),
     objects=("cup", "container", "holder"),
     shapes=("water",),
     levels=(Level("water in the container", _water_level),),
@@ -122,5 +120,6 @@ POUR_WATER = Physics(
         Gap("table-water", ("table", "water"), _water_on_table, touch=0.0),
     ),
     camera=WATER_CAMERA,
+    state=POUR_WATER_STATE,
 )
 """The physics of water, a cup and a container."""

@@ -6,17 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_particle.cup import Cup, Vessel
 from acwm_particle.physics import CONTAINER, CUP
+from acwm_particle.states import POUR_WATER_STATE, SUN, WATER_CAMERA, WATER_RECORDED
 from acwm_particle.water import FRAME, Water
 from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, WATER_ID, WaterDrawing
 from acwm_particle.water_policy import Pourer
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
-
-RECORDED = 600
-"""Number of particles whose positions are recorded."""
 
 _SETTLING = 8  # frames before frame 0 in which the water comes to rest in the cup
 
@@ -66,30 +64,6 @@ _ACTION = ActionSpec(
     kind="delta",
 )
 
-_STATE = (
-    StateField(
-        "water_position",
-        (RECORDED, 3),
-        "m",
-        f"centres of {RECORDED} particles of water (the same ones in all frames, chosen at random; "
-        "from the first again if there are fewer) in float16, z up",
-    ),
-    StateField("water_count", (1,), "", "how many particles there are"),
-    StateField(
-        "water_share",
-        (3,),
-        "",
-        "shares of the water in the cup, in the container, and spilled on the table; the rest is "
-        "in the air",
-    ),
-    StateField("water_center", (3,), "m", "mean position of all water"),
-    StateField("water_speed", (1,), "m/s", "root mean square speed of the water"),
-    StateField("cup_pose", (4,), "m, rad", "middle of the cup's inside, and its tilt towards +x"),
-    StateField("cup_velocity", (4,), "m/s, rad/s", "of the same"),
-    StateField("cup_target", (4,), "m, rad", "where the spring pulls the cup"),
-    StateField("container_position", (3,), "m", "middle of the foot of the container"),
-)
-
 
 class PourWater(SceneEnvironment[Water]):
     """Water in a glass cup, and a glass container on a table to pour it into.
@@ -113,11 +87,13 @@ class PourWater(SceneEnvironment[Water]):
         horizon=300,
         factors=_FACTORS,
         ood_shifts=("water_level",),
-        state=_STATE,
+        state=POUR_WATER_STATE,
         instances=("table", "cup", "container", "water", "holder"),
         engine="Taichi (position-based fluids)",
         episodes={"train": 1000, "ind_test": 50, "ood_test": 50},
         citation="ACWM-Phys, arXiv:2605.08567",
+        camera=WATER_CAMERA,
+        light=SUN,
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Water:
@@ -140,7 +116,7 @@ class PourWater(SceneEnvironment[Water]):
 
     def _state(self) -> dict[str, NDArray[Any]]:
         water, cup = self.simulation, self.simulation.cup
-        chosen = np.arange(RECORDED) % len(water.particles)
+        chosen = np.arange(WATER_RECORDED) % len(water.particles)
         speeds = (water.velocities.astype(np.float64) ** 2).sum(1)
         return {
             "water_position": water.numbered[chosen].astype(np.float16),

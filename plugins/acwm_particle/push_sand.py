@@ -6,24 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
-from acwm_core.env.symmetry import Symmetry, permuted
+from acwm_core.env.symmetry import Symmetry
 from acwm_particle.physics import BOARD, HEIGHT_EXTENT
 from acwm_particle.sand import CLEARANCE, FRAME, Pose, Sand
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID, SandDrawing
 from acwm_particle.sand_layout import DOUBLED, GRAINS, pour
 from acwm_particle.sand_policy import Raker, heading
+from acwm_particle.states import GRAINS_RECORDED, HEIGHT_CELLS, PUSH_SAND_STATE, SAND_CAMERA, SUN
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 RADIUS = 0.0105
 """Radius of a grain in metres."""
-
-RECORDED = 1000
-"""Number of grains whose positions are recorded."""
-
-HEIGHT_CELLS = (24, 40)
-"""Rows (along y, from the near edge) and columns (along x) of the recorded height map."""
 
 _SETTLING = 20  # frames before frame 0 in which the poured sand comes to rest
 
@@ -75,38 +70,9 @@ _ACTION = ActionSpec(
     kind="delta",
 )
 
-_STATE = (
-    StateField(
-        "grain_position",
-        (RECORDED, 3),
-        "m",
-        f"centres of the first {RECORDED} grains (their order is random) in float16, z up",
-    ),
-    StateField("grain_count", (1,), "", "how many grains there are"),
-    StateField("sand_center", (3,), "m", "mean position of all grains"),
-    StateField(
-        "sand_height",
-        HEIGHT_CELLS,
-        "m",
-        "top of the sand over a grid on the table: rows from near to far (y), columns from left "
-        "to right (x), in float16",
-    ),
-    StateField("board_position", (3,), "m", "centre of the board"),
-    StateField("board_quaternion", (4,), "", "orientation of the board (w, x, y, z)"),
-    StateField("board_velocity", (3,), "m/s", "mean velocity of the board in the last frame"),
-)
-
-# Not of the sand's own state: the order in which grains are treated is not mirrored, so that a
-# mirrored heap shifts by a millimetre, and then grains part as after any other start.
-_MIRROR = Symmetry(
-    (-1, 2, 3, 4, 5, -6, -7),
-    mirrored=True,
-    states={
-        "board_position": (-1, 2, 3),
-        "board_quaternion": (1, 2, -3, -4),
-        "board_velocity": (-1, 2, 3),
-    },
-)
+# The sand's own state is not exactly mirrored: the order in which grains are treated is not, so
+# that a mirrored heap shifts by a millimetre, and then grains part as after any other start.
+_MIRROR = Symmetry((-1, 2, 3, 4, 5, -6, -7), mirrored=True)
 
 
 class PushSand(SceneEnvironment[Sand]):
@@ -133,12 +99,14 @@ class PushSand(SceneEnvironment[Sand]):
         horizon=64,
         factors=_FACTORS,
         ood_shifts=("grain_count",),
-        state=_STATE,
+        state=PUSH_SAND_STATE,
         instances=("ground", "sand", "board"),
         engine="Taichi (PBD)",
         episodes={"train": 1784, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
         symmetries=(_MIRROR,),
+        camera=SAND_CAMERA,
+        light=SUN,
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Sand:
@@ -163,7 +131,7 @@ class PushSand(SceneEnvironment[Sand]):
     def _transform(self, symmetry: Symmetry) -> None:
         board = self.simulation.board
         self.simulation.grains[:, 0] *= -1
-        turn = permuted(board.quaternion, symmetry.states["board_quaternion"])
+        turn = board.quaternion * [1, 1, -1, -1]
         self.simulation.put_board(Pose(board.position * [-1, 1, 1], turn))
         self._before = self.simulation.board.position
 
@@ -174,7 +142,7 @@ class PushSand(SceneEnvironment[Sand]):
     def _state(self) -> dict[str, NDArray[Any]]:
         sand, board = self.simulation, self.simulation.board
         return {
-            "grain_position": sand.grains[:RECORDED].astype(np.float16),
+            "grain_position": sand.grains[:GRAINS_RECORDED].astype(np.float16),
             "grain_count": np.array([len(sand.grains)], np.int32),
             "sand_center": sand.grains.mean(0, dtype=np.float64).astype(np.float32),
             "sand_height": height_map(sand.grains, sand.radius),

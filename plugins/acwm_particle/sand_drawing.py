@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from acwm_particle.physics import SAND_CAMERA
 from acwm_particle.sand import Sand
 from acwm_particle.sand_layout import DOUBLED
+from acwm_particle.states import SAND_CAMERA, SUN
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import Mesh, box, capsule, cylinder, join, plane
@@ -25,7 +25,7 @@ SANDS: dict[str, Vec3] = {
 }
 
 LIGHTS: dict[str, Light] = {
-    "noon": Light(direction=(0.5, -0.45, 1.1), softness=0.003),
+    "noon": Light(direction=SUN, softness=0.003),
     "evening": Light(direction=(-1.0, -0.35, 0.75), sun=(0.92, 0.70, 0.48), sky=(0.26, 0.28, 0.38)),
     "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.03),
 }

@@ -3,7 +3,8 @@
 import numpy as np
 
 from acwm_particle.cup import THICKNESS, Vessel, tilted
-from acwm_particle.physics import CONTAINER, CUP, WATER_CAMERA
+from acwm_particle.physics import CONTAINER, CUP
+from acwm_particle.states import SUN, WATER_CAMERA
 from acwm_particle.water import RADIUS, Water
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
@@ -26,7 +27,7 @@ WATERS: dict[str, Vec3] = {
 }
 
 LIGHTS: dict[str, Light] = {
-    "noon": Light(direction=(0.5, -0.45, 1.1), softness=0.012),
+    "noon": Light(direction=SUN, softness=0.012),
     "evening": Light(direction=(-1.0, -0.35, 0.75), sun=(0.92, 0.70, 0.48), sky=(0.26, 0.28, 0.38)),
     "overcast": Light(sun=(0.30, 0.30, 0.30), sky=(0.62, 0.65, 0.70), softness=0.08),
 }

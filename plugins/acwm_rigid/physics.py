@@ -7,8 +7,15 @@ from itertools import combinations
 
 import numpy as np
 
-from acwm_core.env.physics import Gap, Observation, Physics, Reading, States
-from acwm_sim.camera import Camera
+from acwm_core.env.physics import Gap, Observation, Physics, States, readings_of
+from acwm_rigid.states import (
+    CUBES,
+    PAIR,
+    STACK_CAMERA,
+    STACK_CUBE_STATE,
+    TABLE_CAMERA,
+    push_cube_state,
+)
 from acwm_sim.geometry import (
     Array,
     axes_of,
@@ -23,40 +30,29 @@ INNER = 0.30
 
 PUSHER_RADIUS = 0.03
 
-TABLE_CAMERA = Camera(eye=(0, 0, 1.25), up=(0, 1, 0), fov=30)
-"""The camera of push_cube."""
-
-STACK_CAMERA = Camera(eye=(1.10, -0.75, 0.85), target=(0.42, 0.0, 0.175), fov=34)
-"""The camera of stack_cube with nominal factors."""
-
-_CUBES = ("cube_1", "cube_2", "cube_3", "cube_4", "cube_5")
-_PAIR = ("red_cube", "green_cube")
-
 
 def _push_cube(pushers: tuple[str, ...]) -> Physics:
     """The physics of cubes that slide on a table, and of the pushers."""
+    state = push_cube_state(pushers)
     touched = [
         ("pusher-cube", (pusher, cube), partial(_pusher_to_cube, k, slot))
         for k, pusher in enumerate(pushers)
-        for slot, cube in enumerate(_CUBES)
+        for slot, cube in enumerate(CUBES)
     ]
     touched += [
-        ("cube-cube", (_CUBES[a], _CUBES[b]), partial(_cube_to_cube, a, b))
-        for a, b in combinations(range(len(_CUBES)), 2)
+        ("cube-cube", (CUBES[a], CUBES[b]), partial(_cube_to_cube, a, b))
+        for a, b in combinations(range(len(CUBES)), 2)
     ]
     touched += [
         ("wall-cube", ("wall", cube), partial(_cube_to_wall, slot))
-        for slot, cube in enumerate(_CUBES)
+        for slot, cube in enumerate(CUBES)
     ]
     return Physics(
-        readings=(
-            Reading("pusher_position", "position", pushers),
-            Reading("cube_position", "position", _CUBES, present="cube_present"),
-            Reading("cube_yaw", "angle", _CUBES, "quarter_turn", present="cube_present"),
-        ),
-        objects=(*pushers, *_CUBES),
+        readings=readings_of(state, "pusher_position", "cube_position", "cube_yaw"),
+        objects=(*pushers, *CUBES),
         gaps=tuple(Gap(*each, touch=0.0, solid=0.0) for each in touched),
         camera=TABLE_CAMERA,
+        state=state,
     )
 
 
@@ -118,17 +114,14 @@ PUSH_CUBE = _push_cube(("pusher",))
 PUSH_CUBE_TWO_PUSHERS = _push_cube(("pusher_1", "pusher_2"))
 
 STACK_CUBE = Physics(
-    readings=(
-        Reading("hand_position", "position", ("gripper",)),
-        Reading("cube_position", "position", _PAIR),
-        Reading("cube_quaternion", "quaternion", _PAIR, "cube"),
-    ),
-    objects=("arm", "gripper", *_PAIR),
+    readings=readings_of(STACK_CUBE_STATE, "hand_position", "cube_position", "cube_quaternion"),
+    objects=("arm", "gripper", *PAIR),
     gaps=(
-        Gap("cube-cube", _PAIR, _red_to_green, touch=0.0, solid=0.0),
+        Gap("cube-cube", PAIR, _red_to_green, touch=0.0, solid=0.0),
         Gap("floor-cube", ("floor", "red_cube"), _red_to_floor, touch=0.0, solid=0.0),
         Gap("grip", ("gripper", "red_cube"), _grip_on_red, touch=0.0),
     ),
     camera=STACK_CAMERA,
+    state=STACK_CUBE_STATE,
 )
 """The physics of two cubes and the hand of a robot."""

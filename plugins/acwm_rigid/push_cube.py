@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_core.env.symmetry import Axes, Symmetry, group
 from acwm_core.errors import RecipeError
 from acwm_rigid.physics import PUSHER_RADIUS
-from acwm_rigid.push_drawing import MAX_CUBES, PushDrawing, TwoPusherDrawing
+from acwm_rigid.push_drawing import PushDrawing, TwoPusherDrawing
 from acwm_rigid.push_policy import Pusher, Region
 from acwm_rigid.push_simulation import Cubes, PushSimulation
+from acwm_rigid.states import CUBES, MAX_CUBES, TABLE_CAMERA, push_cube_state
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 REACH = 0.26
@@ -75,16 +76,11 @@ _LIMITS = {"friction": (0.0, 5.0), "mass": (0.005, 10.0), "cube_size": (0.02, 0.
 def _symmetry(pushers: int, axes: Axes, **of_frames: Any) -> Symmetry:
     """A symmetry of the square table; `axes` say what it does to (x, y)."""
     targets = [axis + (2 * k if axis > 0 else -2 * k) for k in range(pushers) for axis in axes]
-    # Velocities are left out: squeezed between others, things jerk in no predictable way.
-    each = tuple(range(1, MAX_CUBES + 1))
-    cubes = {"cube_present": each, "cube_position": (*axes, 3)}
-    places = {"pusher_position": axes, **cubes}
-    return Symmetry(tuple(targets), states=places, headings=("cube_yaw",), **of_frames)
+    return Symmetry(tuple(targets), **of_frames)
 
 
 def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) -> EnvironmentCard:
     names = ["pusher"] if pushers == 1 else [f"pusher_{k + 1}" for k in range(pushers)]
-    cubes = [f"cube_{k + 1}" for k in range(MAX_CUBES)]
     axes = [f"{who}_target_{axis}" for who in names for axis in "xy"]
     return EnvironmentCard(
         name=name,
@@ -101,8 +97,8 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
         horizon=66,
         factors=_FACTORS,
         ood_shifts=ood_shifts,
-        state=_state_fields(pushers),
-        instances=("table", "wall", *names, *cubes),
+        state=push_cube_state(tuple(names)),
+        instances=("table", "wall", *names, *CUBES),
         engine="MuJoCo",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
@@ -110,20 +106,7 @@ def _card(name: str, summary: str, pushers: int, ood_shifts: tuple[str, ...]) ->
             _symmetry(pushers, (-1, 2), mirrored=True),
             _symmetry(pushers, (-2, 1), quarter_turns=1),
         ),
-    )
-
-
-def _state_fields(pushers: int) -> tuple[StateField, ...]:
-    n = MAX_CUBES
-    return (
-        StateField("pusher_position", (pushers, 2), "m", "middle of each pusher on the table"),
-        StateField("pusher_velocity", (pushers, 2), "m/s", "velocity of each pusher"),
-        StateField("cube_present", (n,), "", "1 for a cube that is there; others are zero"),
-        StateField("cube_position", (n, 3), "m", "centre in the table's frame, z up"),
-        StateField("cube_quaternion", (n, 4), "", "orientation (w, x, y, z)"),
-        StateField("cube_yaw", (n,), "rad", "heading around z, in [-π, π]"),
-        StateField("cube_velocity", (n, 3), "m/s", "velocity of the centre"),
-        StateField("cube_angular_velocity", (n, 3), "rad/s", "in the table's frame"),
+        camera=TABLE_CAMERA,
     )
 
 

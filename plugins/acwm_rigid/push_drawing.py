@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from acwm_rigid.physics import INNER, PUSHER_RADIUS, TABLE_CAMERA
+from acwm_rigid.physics import INNER, PUSHER_RADIUS
 from acwm_rigid.push_simulation import (
     FIRST_BODY_ID,
     WALL,
@@ -10,11 +10,10 @@ from acwm_rigid.push_simulation import (
     WALL_ID,
     PushSimulation,
 )
+from acwm_rigid.states import MAX_CUBES, PUSHER_HEIGHT, TABLE_CAMERA
 from acwm_sim.camera import Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import box, cylinder, frame_of_boxes, plane
-
-MAX_CUBES = 5
 
 CAMERAS = {"front": TABLE_CAMERA}
 
@@ -43,7 +42,6 @@ LIGHTS: dict[str, Light] = {
 }
 
 _PUSHERS: tuple[Vec3, ...] = ((0.10, 0.11, 0.13), (0.06, 0.48, 0.50))
-_HALF_HEIGHT = 0.05
 _EDGE = 0.08
 
 
@@ -59,7 +57,7 @@ class PushDrawing(Drawing[PushSimulation]):
     def _build(self) -> None:
         self._build_table()
         for k in range(self.pushers):
-            shape = cylinder(PUSHER_RADIUS, _HALF_HEIGHT, 0.004)
+            shape = cylinder(PUSHER_RADIUS, PUSHER_HEIGHT, 0.004)
             self.scene.add_mesh(shape, _PUSHERS[k], instance=FIRST_BODY_ID + k, gloss=0.15)
         for body in range(self.pushers, self.pushers + MAX_CUBES):
             self.scene.add_mesh(box(_EDGE / 2, 0.004), instance=FIRST_BODY_ID + body)
@@ -79,7 +77,7 @@ class PushDrawing(Drawing[PushSimulation]):
         places, turns = np.zeros((count, 3)), np.zeros((count, 3, 3))
         rows = [*range(self.pushers), *(self.pushers + slot for slot in cubes.slots)]
         places[rows], turns[rows] = simulation.poses
-        places[: self.pushers, 2] = _HALF_HEIGHT
+        places[: self.pushers, 2] = PUSHER_HEIGHT
         turns[self.pushers :] *= cubes.edge / _EDGE
         return self.scene.render(places, turns)
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy, StateField
+from acwm_core.env.environment import ActionSpec, EnvironmentCard, Policy
 from acwm_core.env.episode import Factor
 from acwm_rigid.stack_drawing import StackDrawing
 from acwm_rigid.stack_policy import Stacker
 from acwm_rigid.stack_simulation import GREEN, RED, StackSimulation, Start
+from acwm_rigid.states import PAIR, STACK_CAMERA, STACK_CUBE_STATE, STACK_LIGHT
 from acwm_sim.environment import LIGHT, Factors, SceneEnvironment, appearance
 
 DIRECTIONS = {
@@ -84,19 +85,6 @@ _ACTION = ActionSpec(
     kind="delta",
 )
 
-_STATE = (
-    StateField("joint_position", (7,), "rad", "angles of the arm's joints"),
-    StateField("joint_velocity", (7,), "rad/s", "of the arm's joints"),
-    StateField("hand_position", (3,), "m", "grasping point; the robot's base is the origin, z up"),
-    StateField("hand_quaternion", (4,), "", "orientation of the hand (w, x, y, z)"),
-    StateField("gripper_opening", (1,), "m", "distance between the fingertips"),
-    StateField("cube_position", (2, 3), "m", "centres of the red and the green cube"),
-    StateField("cube_quaternion", (2, 4), "", "orientations (w, x, y, z)"),
-    StateField("cube_velocity", (2, 3), "m/s", "velocities of the centres"),
-    StateField("cube_angular_velocity", (2, 3), "rad/s", "in the world's frame"),
-    StateField("stacked", (1,), "", "1 when the red cube rests on the green one, released"),
-)
-
 
 class StackCube(SceneEnvironment[StackSimulation]):
     """A Franka Panda, a red cube and a green cube on a floor.
@@ -119,11 +107,13 @@ class StackCube(SceneEnvironment[StackSimulation]):
         horizon=57,
         factors=_FACTORS,
         ood_shifts=("direction",),
-        state=_STATE,
-        instances=("floor", "arm", "gripper", "red_cube", "green_cube"),
+        state=STACK_CUBE_STATE,
+        instances=("floor", "arm", "gripper", *PAIR),
         engine="PyBullet",
         episodes={"train": 1987, "ind_test": 100, "ood_test": 100},
         citation="ACWM-Phys, arXiv:2605.08567",
+        camera=STACK_CAMERA,
+        light=STACK_LIGHT,
     )
 
     def _begin(self, factors: Factors, rng: np.random.Generator) -> StackSimulation:

@@ -1,7 +1,7 @@
 """Draws stack_cube: its cameras, colours and lights."""
 
-from acwm_rigid.physics import STACK_CAMERA
 from acwm_rigid.stack_simulation import ARM_ID, GREEN_ID, GRIPPER_ID, RED_ID, StackSimulation
+from acwm_rigid.states import STACK_CAMERA, STACK_LIGHT
 from acwm_sim.camera import Camera, Light, Vec3
 from acwm_sim.environment import Drawing, Factors, Frame
 from acwm_sim.meshes import box, plane
@@ -21,7 +21,7 @@ PALETTES: dict[str, tuple[Vec3, Vec3]] = {
 """Colours of the red and the green cube, by the factor `colors`."""
 
 LIGHTS: dict[str, Light] = {
-    "noon": Light(direction=(0.55, -0.35, 1.2), softness=0.008),
+    "noon": Light(direction=STACK_LIGHT, softness=0.008),
     "evening": Light(
         direction=(0.3, 1.0, 0.8), sun=(0.92, 0.70, 0.48), sky=(0.26, 0.28, 0.38), softness=0.008
     ),

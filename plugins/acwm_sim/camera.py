@@ -1,13 +1,12 @@
 """The camera and the light of a scene."""
 
-import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-Vec3 = tuple[float, float, float]
+from acwm_core.env.camera import Camera as Camera
+from acwm_core.env.camera import Vec3 as Vec3
 
 
 def linear(color: Vec3 | NDArray[np.floating]) -> NDArray[np.float32]:
@@ -17,71 +16,6 @@ def linear(color: Vec3 | NDArray[np.floating]) -> NDArray[np.float32]:
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera, independent of the frame size.
-
-    Frame coordinates are measured from the middle of the frame, x to the right and y down, in units
-    of the frame height.
-
-    Attributes:
-        eye: position in metres, world frame (z up).
-        target: the point in the centre of the frame.
-        up: direction that points up in the frame; must not be parallel to the viewing direction.
-        fov: vertical angle of view in degrees. A wider frame sees more to the sides.
-    """
-
-    eye: Vec3
-    target: Vec3 = (0.0, 0.0, 0.0)
-    up: Vec3 = (0.0, 0.0, 1.0)
-    fov: float = 45.0
-
-    @cached_property
-    def axes(self) -> NDArray[np.float64]:
-        """[3, 3]; its rows are the camera's right, down and forward directions in the world."""
-        forward = _unit(np.subtract(self.target, self.eye).astype(np.float64))
-        right = _unit(np.cross(forward, self.up))
-        return np.stack([right, np.cross(forward, right), forward])
-
-    @property
-    def rotation(self) -> NDArray[np.float32]:
-        """[3, 3]; its rows are the camera's right, up and forward directions in the world."""
-        return (self.axes * [[1.0], [-1.0], [1.0]]).astype(np.float32)
-
-    def focal(self, height: int = 1) -> float:
-        """Focal length in pixels for a frame of this height; in frame heights for `height` 1."""
-        return height * 0.5 / math.tan(math.radians(self.fov) / 2)
-
-    def to_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert world points [..., 3] to frame coordinates x, y and depth in metres [..., 3]."""
-        local = (np.asarray(points, np.float64) - np.asarray(self.eye)) @ self.axes.T
-        depth = local[..., 2:]
-        return np.concatenate([self.focal() * local[..., :2] / depth, depth], axis=-1)
-
-    def from_frame(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert frame coordinates and depth [..., 3] to world points; inverse of `to_frame`."""
-        depth = seen[..., 2:]
-        local = np.concatenate([seen[..., :2] * depth / self.focal(), depth], axis=-1)
-        return local @ self.axes + np.asarray(self.eye)
-
-    def on_plane(self, seen: NDArray[np.float64], height: float) -> NDArray[np.float64]:
-        """Where rays through frame coordinates [..., 2] meet the plane z = `height`: [..., 3]."""
-        ray = np.concatenate([seen / self.focal(), np.ones_like(seen[..., :1])], axis=-1)
-        direction = ray @ self.axes
-        reach = (height - self.eye[2]) / direction[..., 2:]
-        return np.asarray(self.eye) + reach * direction
-
-    def project(self, points: NDArray[np.floating], height: int, width: int) -> NDArray[np.float32]:
-        """Convert world points [..., 3] to pixel x (right), pixel y (down) and depth in metres.
-
-        The centre of the pixel in row i and column j is at (j + 0.5, i + 0.5).
-        """
-        local = (np.asarray(points) - np.asarray(self.eye)) @ self.rotation.T
-        scale = self.focal(height) / local[..., 2]
-        x, y = width * 0.5 + scale * local[..., 0], height * 0.5 - scale * local[..., 1]
-        return np.stack([x, y, local[..., 2]], axis=-1).astype(np.float32)
 
 
 @dataclass(frozen=True)

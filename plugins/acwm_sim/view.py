@@ -69,7 +69,7 @@ def pack(
     distance = float(np.linalg.norm(center - np.asarray(camera.eye)))
     half_pixel = 0.5 * footprint * distance / focal
     view = np.zeros(LENGTH, np.float32)
-    view[ROTATION:EYE] = camera.rotation.ravel()
+    view[ROTATION:EYE] = (camera.axes * [[1.0], [-1.0], [1.0]]).ravel()  # right, up, forward
     view[EYE:FOCAL] = camera.eye
     view[FOCAL], view[CENTER_X], view[CENTER_Y] = focal, columns * 0.5, rows * 0.5
     for at, row, scale in ((ACROSS, 0, texel), (ALONG, 1, texel), (DEEP, 2, 1.0)):

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 
 from acwm_core.checks.disc import GAIN, SHADE, Disc
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import Environment, StateField
 from acwm_core.env.episode import Factor
 from tests.checks.results import Flaws
@@ -30,7 +31,7 @@ class OtherObservations(Disc):
 
 @FLAWS.caught_by("card is complete", "background")
 class Nameless(Disc):
-    card = replace(Disc.card, instances=("background",))
+    card = replace(Disc.card.recorded, instances=("background",))
 
 
 @FLAWS.caught_by("card survives json", "JSON")
@@ -69,6 +70,54 @@ class OtherState(Disc):
 class BrokenState(Disc):
     def _state(self):
         return {**super()._state(), "position": np.full(2, np.nan)}
+
+
+@FLAWS.caught_by("states are of their kinds", "length 1")
+class StretchedQuaternion(Disc):
+    card = replace(
+        Disc.card,
+        state=(*Disc.card.state, StateField("turn", (4,), "", "of the disc", "quaternion")),
+    )
+
+    def _state(self):
+        return {**super()._state(), "turn": np.array([1.0, 0.1, 0.0, 0.0])}
+
+
+@FLAWS.caught_by("states are of their kinds", "0 or 1")
+class HalfThere(Disc):
+    card = replace(
+        Disc.card, state=(*Disc.card.state, StateField("there", (1,), "", "", "presence"))
+    )
+
+    def _state(self):
+        return {**super()._state(), "there": np.array([0.5])}
+
+
+@FLAWS.caught_by("states follow", "does not follow from still")
+class FollowsNothing(Disc):
+    position, bearing = Disc.card.state
+    card = replace(
+        Disc.card,
+        state=(
+            replace(position, follows=("still",)),
+            bearing,
+            StateField("still", (1,), "m", "what stands"),
+        ),
+    )
+
+    def _state(self):
+        return {**super()._state(), "still": np.zeros(1)}
+
+
+@FLAWS.caught_by("states follow", "does not follow from bearing")
+class FollowsInPart(Disc):
+    position, bearing = Disc.card.state
+    card = replace(Disc.card, state=(replace(position, follows=("bearing",)), bearing))
+
+
+@FLAWS.caught_by("positions are in the masks", "of the frame's height away")
+class YUp(Disc):
+    card = replace(Disc.card, camera=Camera.flat(0.5))
 
 
 @FLAWS.caught_by("masks match card", "no name")

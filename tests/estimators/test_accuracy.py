@@ -161,7 +161,7 @@ def test_an_unknown_environment_has_no_estimator():
 
 def test_recordings_of_the_same_task_have_none():
     card = catalog().component("environment", "push_cube").load().card
-    recorded = dataclasses.replace(card, instances=("scene",))
+    recorded = dataclasses.replace(card.recorded, instances=("scene",))
     assert estimator_for(recorded) is None
 
 

@@ -5,14 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from acwm_core.env.physics import Physics, Reading
+from acwm_core.env.rotations import FOLDS, rotations_of
 from acwm_metrics.pose import (
     LARGEST,
-    PERIODS,
     OrientationError,
     PixelPositionError,
     PositionError,
     angle_between,
-    rotations_of,
     turn_between,
 )
 from tests.metrics.seeing import boxes, clip
@@ -86,7 +85,7 @@ def test_angles_count_up_to_what_looks_the_same(symmetry, turned, error):
     assert OrientationError().value(seen) == pytest.approx(error)
     gone, there = np.full(FRAMES, np.nan), boxes(FRAMES, (2, 2))
     seen = clip(physics, true=there, states={"yaw": yaw}, read={"yaw": gone}, names="a")
-    assert OrientationError().value(seen) == pytest.approx(PERIODS[symmetry] / 2)
+    assert OrientationError().value(seen) == pytest.approx(np.pi / FOLDS[symmetry])
     assert OrientationError().coverage(seen, gone) == 0
 
 

@@ -8,7 +8,8 @@ from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.physics import Observation
 from acwm_particle.cup import THICKNESS
 from acwm_particle.physics import CONTAINER, POUR_WATER
-from acwm_particle.pour_water import RECORDED, PourWater
+from acwm_particle.pour_water import PourWater
+from acwm_particle.states import WATER_RECORDED
 from acwm_particle.water_drawing import CONTAINER_ID, CUP_ID, HOLDER_ID, WATER_ID
 from tests.sim.playing import start, undrawn
 
@@ -71,9 +72,9 @@ def test_out_of_distribution_is_much_lower_or_higher_and_never_overfilled(unseen
 def test_fewer_particles_than_recorded_repeat(unseen):
     _, info = start(unseen, water_level=0.1)
     count = int(info["state"]["water_count"][0])
-    assert count < RECORDED
+    assert count < WATER_RECORDED
     position = info["state"]["water_position"]
-    np.testing.assert_array_equal(position[count:], position[: RECORDED - count])
+    np.testing.assert_array_equal(position[count:], position[: WATER_RECORDED - count])
 
 
 def test_masks_show_everything():

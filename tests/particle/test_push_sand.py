@@ -5,9 +5,10 @@ import pytest
 
 from acwm_core.data.simulate import simulate
 from acwm_core.env.episode import EpisodeSpec
-from acwm_particle.push_sand import RADIUS, RECORDED, PushSand, height_map
+from acwm_particle.push_sand import RADIUS, PushSand, height_map
 from acwm_particle.sand_drawing import BOARD_ID, SAND_ID
 from acwm_particle.sand_layout import DOUBLED, GRAINS
+from acwm_particle.states import GRAINS_RECORDED
 from tests.sim.playing import start, undrawn
 
 pytestmark = pytest.mark.ci
@@ -71,7 +72,7 @@ def test_out_of_distribution_has_twice_the_grains(unseen):
 def test_the_recorded_grains_stand_for_all(unseen):
     start(unseen, index=1)
     grains = unseen.simulation.grains
-    np.testing.assert_allclose(grains[:RECORDED].mean(0), grains.mean(0), atol=0.01)
+    np.testing.assert_allclose(grains[:GRAINS_RECORDED].mean(0), grains.mean(0), atol=0.01)
 
 
 def test_the_height_map_is_the_top_of_the_sand():

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor, FactorValue
-from acwm_pendulum.drawing import draw
+from acwm_pendulum.drawing import VIEW, draw
 
 GRAVITY = 9.81  # m/s²
 MASS = 1.0  # kg
@@ -43,11 +44,20 @@ CARD = EnvironmentCard(
     ),
     ood_shifts=("length", "damping"),
     state=(
-        StateField("angle", (), "rad", "from hanging down, anticlockwise"),
+        StateField(
+            "angle",
+            (),
+            "rad",
+            "from hanging down, anticlockwise",
+            kind="angle",
+            instances=("rod",),
+            axis=(0, 0, 1),  # towards the viewer
+        ),
         StateField("velocity", (), "rad/s", "rate of change of the angle"),
     ),
     instances=("background", "rod", "bob"),
     engine="numpy",
+    camera=Camera.flat(VIEW / 2),
 )
 
 

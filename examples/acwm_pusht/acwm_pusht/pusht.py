@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, Policy, StateField
 from acwm_core.env.episode import Factor, FactorValue
 from acwm_pusht.arena import RADIUS, SIDE, Arena
@@ -42,16 +43,47 @@ CARD = EnvironmentCard(
     ),
     ood_shifts=("scale", "damping"),
     state=(
-        StateField("agent", (2,), "px", "centre of the disc; x right, y down, of 512"),
-        StateField("velocity", (2,), "px/s", "its velocity"),
-        StateField("block", (2,), "px", "origin of the T, in the middle of its bar's upper edge"),
-        StateField("angle", (), "rad", "of the T, clockwise in the picture, from 0 to 2π"),
-        StateField("corners", (8, 2), "px", "of the T's two bars, four each"),
+        StateField(
+            "agent",
+            (2,),
+            "px",
+            "centre of the disc; x right, y down, of 512",
+            kind="position",
+            instances=("agent",),
+        ),
+        StateField("velocity", (2,), "px/s", "its velocity", kind="vector", instances=("agent",)),
+        StateField(
+            "block",
+            (2,),
+            "px",
+            "origin of the T, in the middle of its bar's upper edge",
+            kind="position",
+            instances=("block",),
+        ),
+        StateField(
+            "angle",
+            (),
+            "rad",
+            "of the T, clockwise in the picture, from 0 to 2π",
+            kind="angle",
+            instances=("block",),
+            axis=(0, 0, 1),  # away from the viewer, as y points down
+        ),
+        StateField(
+            "corners",
+            (8, 2),
+            "px",
+            "of the T's two bars, four each",
+            kind="position",
+            instances=("block",),
+            follows=("block", "angle"),
+        ),
     ),
     instances=("background", "wall", "goal", "block", "agent"),
     engine="gym-pusht 0.1.8 (Pymunk)",
     episodes={"train": 10_000, "ind_test": 256, "ood_test": 256},
     citation="Chi et al. 2023, Diffusion Policy, arXiv:2303.04137",
+    camera=Camera.flat(SIDE / 2, (SIDE / 2, SIDE / 2), down=True),
 )
 
 
