@@ -57,6 +57,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     uri = page.file.src_uri
     if uri == "index.md":  # said here, as code hosts show what stands at the head of a page
         page.meta["hide"] = ["navigation", "toc"]
+    if uri == "changelog.md":
+        page.meta["search"] = {"exclude": True}
     if not uri.startswith("source/"):
         markdown = links.rewritten(markdown, links.place_of(uri), uri)
     return re.sub(r"<!-- generated: ([\w-]+) -->", lambda found: _filled(found[1]), markdown)

@@ -58,8 +58,8 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
     worlds = playable(runs, **options)
     if recorded := dict.fromkeys(world.environment for world in worlds if world.data):
         names = f"{', '.join(recorded)} {'are' if len(recorded) > 1 else 'is'} recorded"
-        gone = "the simulator, and with it factors, tasks, errors of states and recording"
-        click.echo(f"left out, as {names}: {gone}")
+        gone = "the simulator, factors, tasks, errors of states and recording"
+        click.echo(f"not available, because {names}: {gone}")
     if folder and worlds[0].data:
         raise RecipeError(f"--export needs a simulator, and {worlds[0].environment} is recorded")
     if folder:

@@ -35,5 +35,5 @@ class Driver(ABC):
         Args:
             frames: the last frames, `[H, W, 3]` each, up to now.
             actions: the raw actions between them, `[A]` each.
-            check: to be called often; it raises once nobody waits for the answer.
+            check: to be called often; it raises once the decision has been cancelled.
         """

@@ -31,7 +31,7 @@ class StoppedError(AcwmError):
 
 
 class GoalEpisode:
-    """Decides in a thread, while the simulator holds still, and goes on until the goal is reached.
+    """Decides in a thread, while the simulator waits, until the goal is reached.
 
     Args:
         live: where it acts.
@@ -135,7 +135,7 @@ class GoalEpisode:
 
     def _check(self) -> None:
         if self._stopped.is_set():
-            raise StoppedError("nobody waits for this decision")
+            raise StoppedError("this decision was cancelled")
 
     def _finish(self) -> None:
         self.solved = True

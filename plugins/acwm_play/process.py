@@ -113,7 +113,7 @@ class SimulatorProcess:
 
     def _ended_error(self) -> PluginError:
         self.alive = False
-        return PluginError(f"the simulator of {self._name} has ended: begin a new scene")
+        return PluginError(f"the simulator of {self._name} has ended: start a new scene")
 
     def _end(self) -> None:
         if self._process.pid is not None:

@@ -1,6 +1,6 @@
 """A recorded video in the place of a simulator: what happened, beside what the model predicts.
 
-The person drives the model alone; the video goes on as it was recorded. If the recorded actions
+The user drives the model alone; the video continues as recorded. If the recorded actions
 drive, both should show the same.
 """
 
@@ -58,7 +58,7 @@ class RecordedVideo:
         return [self._shown(t, action) for t, action in enumerate(actions)]
 
     async def step(self, action: NDArray[np.float32]) -> TimeStep:
-        """The next frame of the video, whatever the action; its last one goes on for ever."""
+        """The next frame of the video, whatever the action; the last one repeats."""
         self._at = min(self._at + 1, len(self._video) - 1)
         bounds = (
             np.asarray(end, np.float32) for end in (self.card.action.low, self.card.action.high)
@@ -68,7 +68,7 @@ class RecordedVideo:
     async def step_by_policy(self, anew: bool) -> TimeStep:
         """The next frame of the video and the action that led to it."""
         if self._at + 1 >= len(self._video):
-            raise DataError("the recording has ended: begin a new scene")
+            raise DataError("the recording has ended: start a new scene")
         return await self.step(self._actions[self._at])
 
     async def still(self) -> NDArray[np.float32]:

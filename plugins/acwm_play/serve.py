@@ -101,11 +101,11 @@ class Server:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         """Run a session. Only our own page may connect: browsers send the origin of the page."""
         if request.headers.get("Origin") != f"http://{request.host}":
-            raise web.HTTPForbidden(text="another page may not play\n")
+            raise web.HTTPForbidden(text="requests from other pages are refused\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=MAX_MESSAGE)
         await socket.prepare(request)
         if len(self._sockets) >= MAX_SESSIONS:
-            reason = f"{MAX_SESSIONS} pages are open already".encode()
+            reason = f"{MAX_SESSIONS} pages are already open".encode()
             await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason)
             return socket
         playing = self._sockets[socket] = asyncio.ensure_future(self._play(socket))
@@ -190,7 +190,7 @@ async def _serve(pool: WorldPool, server: Server, port: int | None, browser: boo
         await runner.setup()
         await web.SockSite(runner, socket).start()
         address = f"http://{HOST}:{socket.getsockname()[1]}/{server.secret}/"
-        click.echo(f"playing at {address} (Ctrl-C ends it)")
+        click.echo(f"playing at {address} (Ctrl-C to stop)")
         if browser:
             asyncio.get_running_loop().run_in_executor(None, webbrowser.open, address)
         await ended.wait()

@@ -130,7 +130,7 @@ def predictability_charts(run: EvaluatedRun) -> list[Chart]:
     if not curves:
         return []
     title = "Predictability horizon: " + "; ".join(horizons)
-    label = "error, as a share of the copy’s"
+    label = "error relative to the first frame’s"
     return [Chart(title, f"{run.key}-predictability", curves, SECONDS, label)]
 
 

@@ -112,7 +112,7 @@ def compare_runs(
     """
     folders = [Path(run) for run in runs]
     if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
-        raise DataError("a comparison needs at least two runs, each named once")
+        raise DataError("a comparison needs at least two different runs")
     summaries = dict(zip(run_labels(folders), map(Summary.read, folders), strict=True))
     warnings = _comparability(summaries)
     first = next(iter(summaries.values()))
@@ -231,7 +231,7 @@ def _estimator(summary: Summary) -> str:
 
 
 def _mode(summary: Summary) -> str | None:
-    """How the model went on; None if nobody knows."""
+    """How the model continued beyond a clip; None if unknown."""
     return None if summary.handed_in else summary.provenance.get("mode", "windows")
 
 
@@ -277,7 +277,7 @@ def _common_clips(
         raise DataError(f"the runs predicted no clip of {split} in common: {remedy}")
     if len(common) < max(map(len, each)):
         counts = ", ".join(str(len(clips)) for clips in each)
-        only = f"only the {len(common)} that all of them predicted are compared"
+        only = f"only the {len(common)} clips common to all are compared"
         warnings.append(f"{split}: the runs predicted {counts} clips; {only}")
     return {label: [rows[clip] for clip in common] for label, rows in runs.items()}
 

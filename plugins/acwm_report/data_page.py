@@ -1,4 +1,4 @@
-"""`write_data_report`: what a dataset tells about itself, as one HTML file."""
+"""`write_data_report`: the report of a dataset, as one HTML file."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ def _delay_chart(found: Survey) -> Chart | None:
     curve = Curve("", "model", list(map(float, seen.shifts)), [100 * each for each in seen.told])
     shaded = None if seen.delay is None else (seen.delay - 0.3, seen.delay + 0.3)
     return Chart(
-        "What a change of the frame tells of an action that nothing before had told",
+        "New information about the action, by delay",
         "delay",
         [curve],
         "frames from the action to the change",
-        "% of what is new",
+        "% of the information",
         points=True,
         ticks=ticks,
         shaded=shaded,
@@ -100,7 +100,7 @@ def _delay_chart(found: Survey) -> Chart | None:
 
 
 def _action_table(found: Survey) -> Table:
-    columns = [Column(each) for each in ("Bounds", "Range", "98 % lie in", "Mean", "SD", "Read")]
+    columns = [Column(each) for each in ("Bounds", "Range", "98 % within", "Mean", "SD", "Read")]
     read = found.following.read if found.following else [float("nan")] * len(found.actions)
     rows = [
         Row(
@@ -120,7 +120,7 @@ def _action_table(found: Survey) -> Table:
     ]
     says = (
         "Models normalise actions by the bounds. Read: the share of an action’s variance that its "
-        "frames tell; an action that is seldom seen is hard to learn."
+        "frames explain; a low value means that the action is hard to learn."
     )
     return Table("", columns, rows, "Action", says, "actions")
 
@@ -155,12 +155,12 @@ def _frame_table(found: Survey) -> Table:
         rows.append(
             Row(phrase, [Cell(str(count)), Cell(share), Cell("; ".join(places) or MISSING)])
         )
-    columns = [Column("Frames"), Column("Share"), Column("For instance")]
+    columns = [Column("Frames"), Column("Share"), Column("Examples")]
     return Table("", columns, rows, "Frames that are", "", "frames")
 
 
 def needs_table() -> Table:
-    """How good `small` became with how much data.
+    """Scores of `small` by amount of data.
 
     It is read from ``needs.yaml``, a list of rows with `world`, `episodes`, `psnr` (dB) and
     `response`, and optionally the same two from a shipped model as a start, `psnr_started` and

@@ -1,4 +1,4 @@
-"""What is said in a line of several draws of each clip."""
+"""The line about several draws of each clip."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def draws_phrase(summary: Summary, split: str) -> str:
     if score := model.get("energy_score"):
         parts.append(f"energy score {_shown(score)}")
     if ratio := model.get("spread_skill"):
-        parts.append(f"spread {_shown(ratio)} of the error of their mean (1 is right)")
+        parts.append(f"spread {_shown(ratio)} of the error of their mean (1 is calibrated)")
     known = {share: model[name] for name, share in COVERAGES.items() if name in model}
     if any(each.value is not None for each in known.values()):
         found = " / ".join(_percent(each) for each in known.values())
         asked = " / ".join(map(str, known))
         parts.append(f"intervals of {asked} % cover {found} % of the positions")
-    what = f"{number} draws" if number > 1 else "the model draws nothing, so its one prediction"
+    what = f"{number} draws" if number > 1 else "the model is deterministic; its one prediction"
     return f"{what}: {'; '.join(parts)}"
 
 

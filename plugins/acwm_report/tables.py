@@ -147,7 +147,7 @@ def ensemble_tables(run: EvaluatedRun) -> list[Table]:
         scale = Scale.of(values, MetricInfo("", higher_is_better=False, factor=1000.0))
         columns = [
             Column("Energy distance", scale.unit, "↓", key="energy_distance"),
-            Column("Two futures differ by", scale.unit, key="spread"),
+            Column("Spread of futures", scale.unit, key="spread"),
         ]
         rows = [
             Row(
@@ -158,8 +158,8 @@ def ensemble_tables(run: EvaluatedRun) -> list[Table]:
         ]
         title = f"{split_title(split)} · {found.clips} clips, {found.starts} starts"
         about = (
-            f"Things start {1000 * found.moved:.2g} mm elsewhere (standard deviation; joints in "
-            f"mrad), which is what a pixel resolves. The model makes {found.draws} of each clip."
+            f"Starts differ by {1000 * found.moved:.2g} mm (standard deviation; joints in mrad), "
+            f"the resolution of a pixel. The model has {found.draws} draws of each clip."
         )
         tables.append(Table(title, columns, rows, "Futures", about, f"ensemble-{split}"))
     return tables
@@ -175,11 +175,11 @@ def label_tables(run: EvaluatedRun) -> list[Table]:
         return []
     name, scale = run.summary.headline, run.headline_scale()
     first = groups[0][1]
-    over = {"copy": "over the copy", "shuffled": "over other actions"}
+    over = {"copy": "above first frame", "shuffled": "above other actions"}
     columns = [Column("Number"), Column(run.headline.title, scale.unit)]
     columns += [Column(title, scale.unit) for each, title in over.items() if each in first.paired]
-    columns += [Column("true actions win")] * ("shuffled" in first.paired)
-    columns += [Column("Codec ceiling", scale.unit)] * ("codec" in first.rows)
+    columns += [Column("true actions better")] * ("shuffled" in first.paired)
+    columns += [Column("Codec bound", scale.unit)] * ("codec" in first.rows)
     rows: list[Row] = []
     for title, scores, strong in groups:
         cells = [Cell(str(scores.clips)), Cell.of(scores.rows["model"][name], scale)]
@@ -206,7 +206,7 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
     key = f"{headline}_over_other_actions"
     others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
-    columns += [Column("over other actions", scales[headline].unit, key=key)] * bool(others)
+    columns += [Column("above other actions", scales[headline].unit, key=key)] * bool(others)
     columns += [Column.of(info, scales[name], name) for name, info in summary.metrics.items()]
     links = {_clip(each.record): each.key for each in videos if each.record.kind == "model"}
     splits = list(summary.splits)
@@ -248,7 +248,7 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         Column("Difference", "second − first", key="difference"),
         Column("Second better", key="second_better"),
         Column("p", "Holm", key="p_corrected"),
-        Column("Larger than chance?", key="winner"),
+        Column("Significant?", key="winner"),
     ]
     rows: list[Row] = []
     for each in found.differences:
@@ -269,7 +269,7 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
     caption = (
         "Mean difference per episode on the clips that both predicted, with its 95 % interval. "
         f"Paired bootstrap over episodes; p-values corrected for {found.tests} comparisons (Holm), "
-        "so that a table without any real difference holds a false alarm in one of twenty cases. "
+        "which keeps the rate of false alarms per table at 5 %. "
         f"{warnings}"
     )
     return Table("", columns, rows, "Runs", caption.strip(), "comparison")

@@ -49,11 +49,9 @@ def print_summary(summary: Summary) -> None:
             click.echo(f"{split}: {phrase}")
     click.echo(_about_intervals(summary))
     if any("shuffled" in result.scores.rows for result in summary.splits.values()):
-        click.echo("`other actions`: the model was given another episode's actions")
+        click.echo("`other actions`: the model with another episode's actions")
     if any(r.scores.shares.get("model") for r in summary.splits.values()):
-        click.echo(
-            "scored: share of the bodies and frames in which the model shows what is measured"
-        )
+        click.echo("scored: share of bodies and frames in which the object was detected")
     for reason in dict.fromkeys(summary.left_out.values()):
         names = [name for name, why in summary.left_out.items() if why == reason]
         click.echo(f"left out: {', '.join(names)}: {reason}")
@@ -73,19 +71,17 @@ def _about_intervals(summary: Summary) -> str:
 
 def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
     """Print where the error comes from, which predictions failed, and which scores are left out."""
-    better = "hand in PNG or NPZ" if handed_in else "see `acwm train-codec`"
+    better = "submit PNG or NPZ" if handed_in else "see `acwm train-codec`"
     from acwm_core.evaluation.shares import error_shares
 
     if found := error_shares(scores):
         click.echo(f"{found}{f' ({better})' if found.codec > MUCH else ''}")
     for row in scores.failed:
         failures = f"{short_title(row)}: {scores.failures(row)}"
-        click.echo(f"{failures}: their scores count as infinitely bad")
+        click.echo(f"{failures}: their scores are infinitely bad")
     undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
     if text := ", ".join(undefined):
-        click.echo(
-            f"scores not defined and not counted: {text} of {scores.clips} clips of the model"
-        )
+        click.echo(f"undefined scores, not counted: {text} of {scores.clips} clips")
 
 
 def print_severity(curve: SeverityCurve) -> None:
@@ -180,7 +176,8 @@ def _print_ensemble(split: str, found: Ensemble) -> None:
         f"{split}: energy distance to the simulator's futures from {found.starts} starts, "
         f"{1000 * found.moved:.2g} mm off, of {found.clips} clips ({drawn}): {away}"
     )
-    click.echo(f"{split}: mean distance of two futures: {apart}".replace(", half against half", ""))
+    apart = apart.replace(", half against half", "")
+    click.echo(f"{split}: mean distance between two futures: {apart}")
 
 
 def _print_action_response(split: str, found: Counterfactual) -> None:
@@ -231,7 +228,7 @@ def about_published(summary: Summary) -> str:
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """Print which runs differ: a table per split, what they are good for, and warnings."""
+    """Print which runs differ: a table per split, their usefulness, and warnings."""
     from rich.console import Console
 
     # A, B … Z, then A1, B1 …, because run names are too long for a table in a terminal

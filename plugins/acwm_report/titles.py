@@ -1,4 +1,4 @@
-"""What splits, rows, baselines and branches of an evaluation are called on a page."""
+"""Titles of splits, rows, baselines and branches of an evaluation."""
 
 from __future__ import annotations
 
@@ -24,26 +24,24 @@ class RowTitle(NamedTuple):
 
 
 ROWS = {
-    "truth": RowTitle(
-        "True video", "noise floor", "the noise floor: the error of the estimator of states"
-    ),
+    "truth": RowTitle("True video", "noise floor", "noise floor: the estimator’s own error"),
     "codec": RowTitle(
-        "Codec reconstruction", "codec alone", "the ceiling: the truth, encoded and decoded"
+        "Codec reconstruction", "codec alone", "upper bound: the truth, encoded and decoded"
     ),
     "perturbed": RowTitle(
         "Simulator, perturbed", "other start", "started a millimetre off; few clips"
     ),
-    "model": RowTitle("Model, true actions", "model", "what is being evaluated"),
+    "model": RowTitle("Model, true actions", "model", "the evaluated model"),
     "mean_of_draws": RowTitle(
-        "Model, mean of its draws", "mean frames", "the mean frames; what is unsure is a haze"
+        "Model, mean of draws", "mean frames", "mean frames; uncertain parts are blurred"
     ),
     "best_of_draws": RowTitle(
-        "Model, best of its draws", "best draw", "in each metric the best draw of each clip"
+        "Model, best of draws", "best draw", "the best draw of each clip in each metric"
     ),
     "shuffled": RowTitle(
         "Model, other actions", "other actions", "same model and noise, another episode’s actions"
     ),
-    "copy": RowTitle("First frame, copied", "first frame", "a prediction in which nothing moves"),
+    "copy": RowTitle("First frame, repeated", "first frame", "nothing moves"),
 }
 """The names of every row of an evaluation, in table order."""
 
@@ -56,22 +54,22 @@ COLUMNS = (
 
 
 ENSEMBLE_ROWS = {
-    "simulator": ("Simulator", "the floor: one half of its futures against the other"),
-    "codec": ("Codec reconstruction", "of the simulator’s futures: the least with this codec"),
-    "model": ("Model", "what is being evaluated"),
-    "copy": ("First frame, copied", "a future in which nothing moves"),
+    "simulator": ("Simulator", "floor: one half of its futures against the other"),
+    "codec": ("Codec reconstruction", "of the simulator’s futures: lower bound on this codec"),
+    "model": ("Model", "the evaluated model"),
+    "copy": ("First frame, repeated", "nothing moves"),
 }
 """Title and explanation of what is compared with the simulator's futures, in table order."""
 
 
-OVER = {"copy": "the copied first frame", "shuffled": "the same model with other actions"}
+OVER = {"copy": "the repeated first frame", "shuffled": "the same model with other actions"}
 """The baselines that a model is compared with on each clip."""
 
 
 BRANCHES = {
     "factual": "Its own actions",
     "another": "Another episode’s actions",
-    "still": "Nothing is moved",
+    "still": "No motion",
     "reversed": "Actions reversed in time",
     "mirrored": "Actions mirrored",
 }

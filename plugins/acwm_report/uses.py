@@ -123,4 +123,4 @@ def use_table(uses: Sequence[Use], runs: Sequence[str], name: str = "uses") -> T
     if not columns:
         return None
     rows = [Row(run, cells[run]) for run in runs]
-    return Table("What the models are good for", columns, rows, "Run", CAPTION, name)
+    return Table("Usefulness of the models", columns, rows, "Run", CAPTION, name)

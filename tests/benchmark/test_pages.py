@@ -46,15 +46,15 @@ def page_of(*words, out):
 def test_a_report_is_made_of_scores(home, tmp_path):
     _, words = page_of("report", home / "squares/slide", out=tmp_path / "report.html")
     assert "a still picture" in words
-    assert "predictions that were handed in, 1,200,000 parameters" in words
+    assert "submitted predictions, 1,200,000 parameters" in words
     assert "acwm score" in words
-    assert "another episode’s actions" not in words.partition("The numbers")[0]
+    assert "another episode’s actions" not in words.partition("Scores")[0]
 
 
 def test_scores_and_a_run_are_compared_in_one_report_and_one_table(home, tmp_path):
     both = home / "run", home / "squares/slide"
     _, words = page_of("report", *both, out=tmp_path / "report.html")
-    assert "Larger than chance?" in words
+    assert "Significance" in words
     found = compare_runs(both)
     assert found.warnings == []
     assert {each.winner for each in found.differences} == {None}

@@ -167,6 +167,6 @@ def test_what_is_found_is_printed_and_on_the_page(evaluated, capsys):
         "Simulator",
         "Codec reconstruction",
         "Model",
-        "First frame, copied",
+        "First frame, repeated",
     ]
     assert table.rows[2].cells[0].value == made.distance["model"].value

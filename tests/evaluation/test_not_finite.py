@@ -78,7 +78,7 @@ def test_every_table_shows_it(failing, tmp_path, capsys):
 
     print_summary(Summary.read(failing))
     shown = capsys.readouterr().out
-    assert "model: 1 of 5 predictions are not finite: their scores count as infinitely bad" in shown
+    assert "model: 1 of 5 predictions are not finite: their scores are infinitely bad" in shown
     assert "-∞" in shown
     page = write_report([failing], tmp_path / "page.html").read_text()
     assert "1 of 5 predictions are not finite" in page

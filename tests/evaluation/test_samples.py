@@ -103,7 +103,7 @@ def test_a_model_that_draws_nothing_is_predicted_once(data, tmp_path, monkeypatc
         assert rows[kind]["mse"] == rows["model"]["mse"]
     assert rows["model"]["spread_skill"].value == 0
     assert len(predicted) == 2 * 9  # own and other actions of five and four clips
-    assert "draws nothing" in draws_phrase(summary, "ind_test")
+    assert "the model is deterministic" in draws_phrase(summary, "ind_test")
 
 
 def test_a_line_and_the_table_show_them(drawn, capsys):

@@ -183,7 +183,7 @@ def test_a_model_is_trained_and_plans(planned, acwm):
     assert "<h3>Corners</h3>" in page
     assert "Narrow · corner" in page
     assert "Videos: Corners · Narrow" in page
-    assert "Everything about this run" in page
+    assert "Details of this run" in page
     code, out, err = acwm("experiment", "widths.yaml", cwd=folder)
     assert (code, err) == (0, "")
     assert f"{STEPS} of {STEPS} steps are done, {STEPS} of them in earlier runs" in out
@@ -234,6 +234,6 @@ def test_results_of_other_settings_are_a_failure_with_a_name(planned, acwm, tmp_
     assert "of another cost, " in second
     assert second.endswith(f"(see experiments/widths/logs/plan-{NAME}.log)")
     page = (made / "report.html").read_text()
-    assert ("<h2>Planning</h2>" in page, "Everything about this run" in page) == (False, True)
+    assert ("<h2>Planning</h2>" in page, "Details of this run" in page) == (False, True)
     code, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=tmp_path)
     assert "failed   plan Corners · Narrow (" in out

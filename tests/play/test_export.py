@@ -133,7 +133,7 @@ def test_models_that_cannot_be_exported_are_refused():
         export_graphs(world, SIZE)
     world = recurrent_world()
     world.codec.memoryless = False
-    with pytest.raises(RecipeError, match="decodes with a memory"):
+    with pytest.raises(RecipeError, match="has a stateful decoder"):
         export_graphs(world, SIZE)
 
 

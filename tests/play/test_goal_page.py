@@ -20,7 +20,7 @@ def test_the_planner_drives_until_the_person_takes_over(page):
     assert "place" in page.inner_text("#aim")
     assert page.locator("#task option").all_inner_texts() == ["place", "place and turn"]
     assert page.inner_text("[data-name=distance] dd").endswith("cm")
-    assert page.inner_text("[data-name=distance] small") == "solved at 1.5 cm"
+    assert page.inner_text("[data-name=distance] small") == "solved within 1.5 cm"
     until(page, "document.querySelector('[data-name=decision] dd').textContent.endsWith(' s')")
     until(page, "document.getElementById('phase').dataset.kind === 'planning'")
     page.keyboard.down("ArrowLeft")
@@ -37,7 +37,7 @@ def test_the_planner_drives_until_the_person_takes_over(page):
 
 def test_a_solved_goal_is_told_and_the_picture_rests(page):
     page.get_by_role("radio", name="Replay").check()  # it needs the start of a scene
-    page.get_by_role("button", name="Same again").click()
+    page.get_by_role("button", name="Same scene").click()
     until(page, SOLVED)
     assert page.inner_text("#phase") == "solved ✓"
     until(page, "document.getElementById('link-text').textContent === 'solved ✓'")

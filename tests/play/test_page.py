@@ -83,7 +83,7 @@ def test_buttons_for_scenes_and_the_models_state(page):
     until(page, "Number(document.body.dataset.alone) > 1")
     page.keyboard.press("x")
     until(page, "Number(document.body.dataset.alone) < 1")
-    page.get_by_role("button", name="Same again").click()
+    page.get_by_role("button", name="Same scene").click()
     until(page, "Number(document.body.dataset.alone) < 0.5")
     assert page.evaluate("() => document.body.dataset.scene") == first
     page.get_by_role("button", name="New scene").click()
@@ -102,7 +102,7 @@ def test_a_factor_goes_out_of_distribution(page):
     page.get_by_label("cube count").select_option(label="5 · not in training")
     until(page, "document.querySelector('#badges .ood')")
     assert "out of distribution: cube count=5" in page.inner_text("#badges")
-    page.get_by_role("button", name="all as drawn").click()
+    page.get_by_role("button", name="reset all").click()
     until(page, "!document.querySelector('#badges .ood')")
 
 
@@ -167,7 +167,7 @@ def test_another_world_is_chosen_in_the_menu(page):
 def test_slow_motion_slows_both_pictures(page):
     """A second takes four; a busy machine only makes it slower still."""
     page.get_by_role("radio", name="¼×").check()
-    page.get_by_role("button", name="Same again").click()
+    page.get_by_role("button", name="Same scene").click()
     until(page, "Number(document.body.dataset.alone) < 0.5")
     until(page, "Number(document.body.dataset.alone) > 0.7")
     began = time.monotonic()

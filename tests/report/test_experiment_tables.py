@@ -118,7 +118,7 @@ def test_the_main_table_is_shown_and_exported_once(experiment, tmp_path):
     runs = evaluated(experiment)
     pages = [write_report(runs, tmp_path / "page.html", experiment=e).read_text()
              for e in (experiment, main)]  # fmt: skip
-    assert ["<h2>The main table</h2>" in page for page in pages] == [True, False]
+    assert ["<h2>Main table</h2>" in page for page in pages] == [True, False]
     assert "<h2>The experiment</h2>" in pages[1]
     export_report(runs[:1], tmp_path / "out", main)
     assert "Mean over seeds" in (tmp_path / "out/tables/main.md").read_text()

@@ -49,7 +49,7 @@ def summary_of(run):
 def test_csv_holds_the_numbers_of_the_summary_at_full_precision(exported):
     run, out = exported
     rows = summary_of(run)["splits"]["ood_test"]["scores"]["rows"]
-    titles = {"model": "Model, true actions", "copy": "First frame, copied"}
+    titles = {"model": "Model, true actions", "copy": "First frame, repeated"}
     table = {row["Prediction"]: row for row in read(out / "tables/scores-ood_test.csv")}
     for kind, title in titles.items():
         for metric in ("mse", "psnr"):

@@ -72,7 +72,7 @@ def planned(tmp_path):
 
 def test_a_table_of_plans_stands_on_the_page_and_in_files(planned, tmp_path):
     text = write_report([planned]).read_text()
-    assert "Whether it plans" in text
+    assert "<h2>Planning with this model</h2>" in text
     assert "&lt;place&gt; · 8 episodes" in text
     assert "<place>" not in text
     # Clopper and Pearson's of 6 of 8, from tables of the beta distribution
@@ -150,7 +150,7 @@ def test_a_leaderboard_has_rankings_and_plans_and_drops_no_run(both):
     page, found = write_leaderboard(both[0].parent)
     assert found.broken == {}  # the table of plans is no evaluation
     assert sorted(found.entries) == ["first", "second"]
-    uses = page.read_text().partition("What the models are good for")[2]
+    uses = page.read_text().partition("Usefulness of the models")[2]
     rows = re.findall(r'<tr>\s*<th scope="row">(?:<.*?>)*(\w+)(.*?)</tr>', uses, re.DOTALL)
     second, first = rows  # the best in distribution first, as above
     assert [first[0], second[0]] == ["first", "second"]
@@ -165,7 +165,7 @@ def test_a_leaderboard_has_rankings_and_plans_and_drops_no_run(both):
 def test_no_table_where_no_run_has_either(tmp_path):
     make_run(tmp_path / "board" / "plain")
     page, _ = write_leaderboard(tmp_path / "board")
-    assert "good for" not in page.read_text()
+    assert "Usefulness" not in page.read_text()
 
 
 def test_a_damaged_ranking_takes_no_run_off_the_leaderboard(both):

@@ -44,7 +44,7 @@ def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     weights = Summary.read(mine).provenance["weights_sha256"]
     write_json(mine / "ranking" / "place" / RANKING_FILE, ranking(weights))
     text = write_report([mine]).read_text()
-    assert "Whether it ranks policies" in text
+    assert "<h2>Ranking policies</h2>" in text
     assert "&lt;place&gt; · 2 policies, 6 episodes of each" in text
     assert "loses 0.2 px per action, at random 0.4, over 6 starts" in text
     assert "<place>" not in text

@@ -233,3 +233,5 @@ def test_the_search_knows_the_guides(site):
     listed = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))["docs"]
     found = [each["location"] for each in listed if "conditioner" in each["title"].lower()]
     assert any("own-conditioner" in location for location in found)
+    assert any(each["location"].startswith("questions.html") for each in listed)
+    assert not [each for each in listed if each["location"].startswith("changelog.html")]

@@ -1,4 +1,4 @@
-"""docs/scaling.md: its table is what is counted, and its commands are recipes that compose."""
+"""docs/scaling.md and reference/memory.md: tables are counted, commands are valid recipes."""
 
 import re
 import shlex
@@ -19,7 +19,8 @@ from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe
 
-TEXT = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+TEXT = "".join((DOCS / n).read_text() for n in ("scaling.md", "reference/memory.md"))
 COMMANDS = re.findall(r"(?:acwm|acwm_core\.cli) fit ([^;`\n]+)", TEXT.replace("\\\n", " "))
 
 

@@ -161,7 +161,7 @@ def _check_exportable(world: WorldModel) -> None:
     if not isinstance(world.model, CarriesState):
         why = f"a {name} cannot be exported: choose a model without sampling, such as recurrent"
     elif not world.codec.memoryless:
-        why = f"a {type(world.codec).__name__} decodes with a memory, which is not exported"
+        why = f"a {type(world.codec).__name__} has a stateful decoder, which cannot be exported"
     elif sum(weight.numel() for weight in world.parameters()) > MAX_PARAMETERS:
         why = f"this model has more than {MAX_PARAMETERS:,} parameters, too many for a page"
     elif torch.__version__ < NEEDS_TORCH:

@@ -89,11 +89,11 @@ def _about(
     return {
         **about,
         "recorded": True,
-        "engine": "of the simulator",
+        "engine": "from the simulator",
         "drivers": [],
         "tasks": [],
         "metrics": {},
-        "why_not": "the page has no instruments",
+        "why_not": "the page has no estimator",
         "factors": [],
         "asked": {},
         "drawn": {},

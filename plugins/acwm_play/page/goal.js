@@ -51,8 +51,8 @@ function showProgress(now, passed) {
   const { unit, tolerance } = world.tasks.find(({ name }) => name === aim.task);
   aim.solved = now.solved;
   seconds += passed;
-  const small = now.failed ? "failed for good" : `solved at ${length(tolerance, unit)}`;
-  tile("distance", "To the goal", length(now.distance, unit), small, now.solved ? "good" : now.failed ? "bad" : "");
+  const small = now.failed ? "failed; start a new scene" : `solved within ${length(tolerance, unit)}`;
+  tile("distance", "Distance to goal", length(now.distance, unit), small, now.solved ? "good" : now.failed ? "bad" : "");
   note("distance", seconds, now.distance);
   showAttempt();
 }
@@ -62,10 +62,10 @@ const length = (value, unit) => unit ? measured(value, unit) : `${(100 * value).
 function attempted(message) {
   if (message.phase !== attempt.phase) since = performance.now();
   attempt = message;
-  if (message.phase === "planning" && message.decisions === 0) tile("decision", "Decision", "–", "", "");
+  if (message.phase === "planning" && message.decisions === 0) tile("decision", "Decision time", "–", "", "");
   if (message.decisions) {
-    const many = message.decisions > 1 ? `the last of ${message.decisions}` : "the first";
-    tile("decision", "Decision", `${message.took.toFixed(1)} s`, many, "");
+    const many = message.decisions > 1 ? `number ${message.decisions}` : "number 1";
+    tile("decision", "Decision time", `${message.took.toFixed(1)} s`, many, "");
   }
   showAttempt();
 }

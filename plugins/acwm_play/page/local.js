@@ -32,7 +32,7 @@ class LocalServer {
     else if (wish.type === "step") this.stepping = true;
     else if (wish.type === "speed") this.speed = wish.value;
     else if (wish.type === "drive") {
-      if (wish.by === "policy" && this.drifted) this.again = true; // it goes on where it stopped
+      if (wish.by === "policy" && this.drifted) this.again = true; // continue where it stopped
       [this.driver, this.values, this.places] = [wish.by, null, null];
     }
   }

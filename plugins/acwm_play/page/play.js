@@ -58,13 +58,13 @@ function connect() {
 
 async function lost(code, reason) {
   tries += 1;
-  let text = "The server is gone. Trying to reach it again …", wait = Math.min(400 * tries, 3000);
-  if (code === 1013) [text, wait] = [`Too many pages: ${reason}. Close one and this one goes on.`, 3000];
+  let text = "The server does not respond. Reconnecting …", wait = Math.min(400 * tries, 3000);
+  if (code === 1013) [text, wait] = [`Too many pages: ${reason}. Close one to continue here.`, 3000];
   else if (code === 1008) text = `The server refused: ${reason}`;
   else {
     const answer = await fetch("play.js", { cache: "no-store" }).catch(() => null);
     if (answer && answer.status === 403) {
-      text = "The server was started anew with another address: open the one that it printed.";
+      text = "The server was restarted with another address: open the one that it printed.";
     }
   }
   $("banner").textContent = text;
@@ -194,7 +194,7 @@ function play(now) {
 function headline(head) {
   $("alone-text").textContent = `${head.alone.toFixed(1)} s`;
   if (head.places && state.driver !== "you") rings(places = head.places);
-  tile("alone", "On its own", `${head.alone.toFixed(1)} s`, `since it saw the ${world.recorded ? "recording" : "simulator"}`);
+  tile("alone", "Free-running time", `${head.alone.toFixed(1)} s`, `since the last true frame`);
   const error = head.pixel_error === null ? null : head.pixel_error * 100; // null: nothing is beside it
   note("pixel_error", head.alone, error);
   tile("pixel_error", "Pixel error", error === null ? "–" : `${error.toFixed(1)} %`, "root mean square");
@@ -209,13 +209,13 @@ function headline(head) {
 
 const FULL_SPREAD = 0.06; // from here on the border of the model's picture is red
 
-// How far draws of the model are apart: null or undefined where it cannot tell.
+// Standard deviation of samples: null or undefined where it is not known.
 function spread(at, share) {
-  const told = typeof share === "number";
-  if (!told && !document.querySelector(".tiles [data-name=spread]")) return;
-  document.body.style.setProperty("--doubt", told ? Math.min(share / FULL_SPREAD, 1).toFixed(3) : 0);
-  tile("spread", "Spread", told ? `${(share * 100).toFixed(1)} %` : "–", "of the model’s draws");
-  note("spread", at, told ? share * 100 : null);
+  const known = typeof share === "number";
+  if (!known && !document.querySelector(".tiles [data-name=spread]")) return;
+  document.body.style.setProperty("--doubt", known ? Math.min(share / FULL_SPREAD, 1).toFixed(3) : 0);
+  tile("spread", "Spread", known ? `${(share * 100).toFixed(1)} %` : "–", "of the model’s samples");
+  note("spread", at, known ? share * 100 : null);
 }
 
 setInterval(() => {
@@ -225,7 +225,7 @@ setInterval(() => {
   if (HOLDING.includes(attempt.phase)) return link("on", PHASES[phase()]);
   const span = shownTimes.length > 1 ? (shownTimes.at(-1) - shownTimes[0]) / (shownTimes.length - 1) : 0;
   const rate = span ? (1000 / span).toFixed(1) : "–";
-  const delay = latency === null ? "" : ` · ${latency.toFixed(1)} s from hand to picture`;
+  const delay = latency === null ? "" : ` · latency ${latency.toFixed(1)} s`;
   link("on", `${rate} frames/s${delay}`);
 }, 500);
 
@@ -260,14 +260,14 @@ function figures(read) {
   const titles = { mask_iou: "Mask overlap" };
   for (const [name, { title, unit }] of Object.entries(world.metrics)) {
     const floor = read.floors[name];
-    const small = floor === undefined || floor === null ? "" : `simulator itself: ${measured(floor, unit)}`;
+    const small = floor === undefined || floor === null ? "" : `noise floor: ${measured(floor, unit)}`;
     tile(name, titles[name] || title, measured(read.values[name], unit), small);
     note(name, read.alone, read.values[name]);
   }
   if (!world.why_not) {
     const names = read.missing.map((each) => each.replaceAll("_", " ")).join(", ");
     const count = read.missing.length;
-    tile("missing", "Not seen", count ? `${count} object${count > 1 ? "s" : ""}` : "none", names || "all objects are there", count ? "bad" : "");
+    tile("missing", "Missing objects", count ? `${count}` : "none", names || "all are visible", count ? "bad" : "");
   }
 }
 
@@ -355,11 +355,11 @@ function dials(about) {
   const first = about.controls.filter((each) => each.place < 2 && each.keys);
   how.replaceChildren();
   const keys = first.flatMap((each) => each.keys).map((code) => make("kbd", keyName(code)));
-  if (pointed) how.append("Drag in either picture: it follows the pointer. Or use ", ...keys);
-  else how.append("Drag in a picture like a stick, or use ", ...keys, ", the sliders or a gamepad");
-  how.append(", with ", make("kbd", "Shift"), " for less.");
+  if (pointed) how.append("Drag in either picture, or use ", ...keys);
+  else how.append("Drag in a picture as on a joystick, or use ", ...keys, ", the sliders or a gamepad");
+  how.append(", with ", make("kbd", "Shift"), " for smaller steps.");
   $("why").textContent = about.stride > 1
-    ? `The model predicts ${about.stride} frames at once. So both pictures are shown ${(about.stride / about.fps).toFixed(1)} s late, and always show the same moment.`
+    ? `The model predicts ${about.stride} frames at once, so both pictures are delayed by ${(about.stride / about.fps).toFixed(1)} s. They always show the same moment.`
     : "Both pictures always show the same moment.";
   $("stick").hidden = pointed || about.controls.length < 2;
   $("dials").replaceChildren(...(pointed ? [] : about.controls.map(dial)));
@@ -583,7 +583,7 @@ function pad() {
 function show(now) {
   state = { ...state, ...now };
   $("pause").setAttribute("aria-pressed", state.paused);
-  $("pause").firstElementChild.textContent = state.paused ? "Go on" : "Pause";
+  $("pause").firstElementChild.textContent = state.paused ? "Continue" : "Pause";
   $("step").disabled = !state.paused;
   $("record").setAttribute("aria-pressed", state.recording);
   if (!state.recording) $("record").querySelector("span").textContent = "Record";
