@@ -1,7 +1,7 @@
 """Errors for users: one clear sentence that says what to do next, and notes of where it arose.
 
-For every `AcwmError`, the command line prints only the message and exits with code 2. It does so
-too for an error of a component, which carries a note that says where it arose. An error without a
+For every `AcwmError`, the command line prints only the message and exits with code 2, and likewise
+for an error of a component, which carries a note that says where it arose. An error without a
 note is a bug in acwm and keeps its traceback.
 """
 
@@ -62,7 +62,7 @@ def noting(
         where: a phrase that begins with a preposition.
         *components: components that run in the block, or modules by name. The note names the last
             line in one of their packages.
-        unless: errors that get no note, such as an `AcwmError` that says all by itself.
+        unless: errors that get no note, such as an `AcwmError` that is complete.
     """
     try:
         yield

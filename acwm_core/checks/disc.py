@@ -40,7 +40,7 @@ class Disc(Environment):
 
     card = EnvironmentCard(
         name="disc",
-        summary="A disc that moves as told.",
+        summary="A disc that moves by its actions.",
         action=ActionSpec(("vx", "vy"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "delta"),
         frame_size=(128, 192),
         fps=10,

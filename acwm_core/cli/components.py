@@ -33,9 +33,9 @@ def list_components(kind: str | None) -> None:
     """List the installed components, or the recipes.
 
     Recipes use these names; an estimator has the name of its environment, and a task is
-    ENVIRONMENT.TASK. The list also shows each component's plugin and what it needs that is not
-    installed. KIND lists one kind only, such as environment or codec; task also says what each is,
-    kind lists the kinds, and recipe the recipes that `acwm fit` takes.
+    ENVIRONMENT.TASK. The kinds and their numbers come first, then each component with its plugin
+    and what it needs that is not installed. KIND lists one kind only, such as environment or
+    codec; recipe lists the recipes that `acwm fit` takes.
     """
     from rich.console import Console
 
@@ -46,6 +46,8 @@ def list_components(kind: str | None) -> None:
     known = catalog().kinds
     if kind not in (None, "kind", *known):
         raise unknown_name("kind", kind, [*known, "kind", "recipe"])
+    if kind is None:
+        console.print(_counts(), end="\n\n")
     for each in [kind] if kind else known:
         console.print(_table(each, with_tasks=kind == "task"), end="\n\n")
     for problem in catalog().problems:
@@ -61,6 +63,18 @@ def _recipes() -> Table:
     table = Table("recipe", "summary", box=None)
     for row in recipe_summaries().items():
         table.add_row(*map(escape, row))
+    return table
+
+
+def _counts() -> Table:
+    from rich.table import Table
+
+    from acwm_core.recipe import recipe_summaries
+
+    table = Table("number", "`acwm list KIND`", box=None)
+    for kind in catalog().kinds:
+        table.add_row(str(len(list(catalog().registry(kind)))), kind)
+    table.add_row(str(len(recipe_summaries())), "recipe")
     return table
 
 
@@ -112,7 +126,7 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
         raise unknown_name("component", name, known)
     suites = {kind: suite for kind in kinds if (suite := _suite(kind))}
     if not suites:
-        raise RecipeError(f"there are no checks of {_plural(kinds[0])}, and so none of {name}")
+        raise RecipeError(f"{name} cannot be checked: there are no checks of {_plural(kinds[0])}")
     parameters = _parameters_of_suites(name, [*suites], overrides)
     failed = 0
     for kind, suite in suites.items():

@@ -60,7 +60,7 @@ def doctor() -> int:
 
     console = Console(highlight=False)
     failures = 0
-    with console.status("looking; the simulators take some seconds"):
+    with console.status("checking; the simulators take some seconds"):
         for what, works, note in findings():
             failures += works is False
             console.print(_MARKS[works], Text(f"{what:<28}"), Text(note), soft_wrap=True)
@@ -73,7 +73,7 @@ def findings() -> Iterator[Finding]:
     from acwm_core.plugins import catalog
 
     works = (3, 11) <= sys.version_info < (3, 14)
-    advice = "" if works else "; the simulators ship wheels for Python 3.11, 3.12 and 3.13 alone"
+    advice = "" if works else "; the simulators ship wheels only for Python 3.11, 3.12 and 3.13"
     yield Finding("Python", works, f"{platform.python_version()}{advice}")
     yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
     yield from map(_package, PACKAGES)
@@ -98,7 +98,7 @@ def trial_of_engine(components: Sequence[Component]) -> Finding:
     first, *others = components
     what, works, note = trial(first)
     names = ", ".join(other.name for other in others)
-    return Finding(what, works, f"{note}; {names} use the same simulator" if names else note)
+    return Finding(what, works, f"{note}; same simulator as {names}" if names else note)
 
 
 def trial(component: Component) -> Finding:

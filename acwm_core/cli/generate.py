@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     "--exploration",
     type=float,
     default=0.0,
-    help="Share of the training episodes, 0 to 1, that reuse the actions of the episode before.",
+    help="Share of the training episodes, 0 to 1, that reuse the previous episode's actions.",
 )
 @click.option(
     "--shift",

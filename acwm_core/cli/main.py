@@ -153,7 +153,7 @@ def _refuse_a_deleted_folder() -> None:
 _show_any_warning = warnings.showwarning
 
 _warnings: set[str] = set()
-"""Those that this command has shown; each is told once."""
+"""Those that this command has shown; each is shown once."""
 
 
 def _show_warning(
@@ -183,7 +183,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
     "--trust-recipe",
     is_flag=True,
     expose_value=False,
-    help="Run code that a recipe names, e.g. a callback; what is typed is run anyway.",
+    help="Run code that a recipe names, e.g. a callback; names that you type are always run.",
 )
 def main() -> None:
     """Action-conditioned video world models: simulate, train, evaluate.

@@ -112,19 +112,18 @@ class EpisodeDataset:
         path: the data folder, or its URL. Shards behind a URL are fetched on first use and kept in
             a cache (see `acwm_core.data.remote`).
         split: which of its splits.
-        growing: take the first episodes that are finished, while others are still being made.
+        growing: use the episodes that are finished, while others are still being made.
 
     Attributes:
         path: the local data folder; for a URL, its folder in the cache.
         card: the folder's card.
         lengths: number of frames of every episode.
-        checksum: hash of everything the split holds; of what is growing, of the card that it is
-            made by.
+        checksum: hash of everything the split holds; for growing data, of its card.
         shards: for each shard, the index of its first episode and its number of episodes.
 
     Raises:
         DataError: no such folder or split, or its generation was not finished.
-        DataError: nothing is finished of what is growing, or it was not simulated here.
+        DataError: growing data has no finished episode, or was not simulated here.
     """
 
     def __init__(self, path: str | Path, split: Split, *, growing: bool = False) -> None:

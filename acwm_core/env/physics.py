@@ -48,7 +48,7 @@ States = Mapping[str, NDArray[Any]]
 Measure = Callable[[Observation, States], NDArray[np.float64]]
 """Measures each frame of an observation: `[T]`, or `[T, n]` for a `Level`; NaN where unknown.
 
-The states of the first frame, which every model is given, tell what never changes and need not be
+The states of the first frame, which every model is given, hold what never changes and need not be
 estimated, e.g. the sizes of bodies and the positions of fixtures.
 """
 
@@ -219,7 +219,7 @@ class StateEstimator(ABC):
 
     It is registered under the name of its environment, and constructed with the environment's card,
     whose frame size is that of the videos. It sees only frames, neither actions nor ground truth,
-    and treats simulated and predicted videos alike.
+    and treats simulated and predicted videos in the same way.
 
     One instance reads many clips, possibly several at once in different threads.
 

@@ -55,7 +55,7 @@ def observed(infos: Sequence[Mapping[str, Any]]) -> Observation:
 
 
 class Task(ABC):
-    """What is to be reached in an environment. A task stores no state of an episode.
+    """A goal, distance and success in an environment. A task stores no state of an episode.
 
     Distance, success and failure are computed from the frames of an `Observation`, made by the
     simulator (`observed`) or by an estimator. They therefore use only what estimators can read,

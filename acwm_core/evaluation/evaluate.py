@@ -50,7 +50,7 @@ from acwm_core.training.run_folder import RunFolder, run_to_write
 
 @dataclass(frozen=True)
 class Entrant:
-    """What is evaluated, as its results tell it.
+    """What is evaluated, as recorded in its results.
 
     Attributes:
         parts: see `Summary.parts`.

@@ -29,7 +29,7 @@ Numbers = Sequence[float] | NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted clip of T frames beside the true one and all that the simulator knows of it.
+    """A predicted clip of T frames, the true one, and what the simulator knows about it.
 
     Attributes:
         video: the predicted frames, `[T, 3, H, W]` float32 in [0, 1].
@@ -42,10 +42,10 @@ class Prediction:
         estimator: reads states and masks from video of this environment; None if there is none.
         branches: predictions of other actions from the same first frame, each with the video that
             the simulator makes of them as `target`; empty unless requested.
-        draws: all draws of the clip, of which `video` is the first; a single one if the model draws
-            none. Empty unless several are asked for.
-        clip: which clip of an evaluation it is.
-        kind: what predicted it there, see `acwm_core.evaluation.clips.Predictor`.
+        draws: all draws of the clip, of which `video` is the first; a single one if the model is
+            deterministic. Empty unless several are requested.
+        clip: the clip of the evaluation.
+        kind: its predictor, see `acwm_core.evaluation.clips.Predictor`.
         ood_label: the factors of the episode that were shifted out of distribution, if any.
     """
 
@@ -255,10 +255,10 @@ class Metric(ABC):
         return 1.0
 
     def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
-        """Share of the clip that is scored by what is seen in it, in [0, 1]; NaN if there is none.
+        """Share of the clip whose score is based on detections, in [0, 1]; NaN if there is none.
 
-        By default it is the share of frames with a defined score. A metric that scores what it does
-        not find, for example where it was last seen, gives the share that it finds.
+        By default it is the share of frames with a defined score. A metric that scores
+        undetected objects, for example at their last position, returns the detected share.
 
         Args:
             curve: the result of `curve` for the clip.

@@ -22,16 +22,16 @@ frame `[B, L]`."""
 class DynamicsModel(nn.Module, ABC):
     """A network that an objective trains to predict latent frames from embedded actions.
 
-    It is a `Denoiser`, which takes part in a sampling that removes noise step by step, or a
-    `Predictor`, which computes the frames at once.
+    It is a `Denoiser`, which removes noise step by step, or a `Predictor`, which computes frames
+    directly.
 
     Every model takes the keyword argument `latent_channels`, which the framework fills in from the
     codec. Its own parameters come after it and are set in the recipe. The latent size h × w and the
     length L are those of the input; a model raises `ShapeError` for sizes it does not support.
 
     A model with layers calls the conditioner before the first one (`Conditioning.inject_input`) and
-    after each (`Conditioning.inject`), and goes on with the tokens that it returns. Otherwise, a
-    conditioner that acts there would have no effect, and nobody would be told.
+    after each (`Conditioning.inject`), and continues with the tokens that it returns. Otherwise, a
+    conditioner that acts there would fail silently.
 
     Attributes:
         width: width D of the conditioner's modulation and of the tokens before the first layer.
@@ -65,7 +65,7 @@ class DynamicsModel(nn.Module, ABC):
 
 
 class Denoiser(DynamicsModel):
-    """A network that is evaluated on noisy latents, as often as its objective asks for.
+    """A network that is evaluated on noisy latents, as often as its objective requires.
 
     A denoiser that can be built causal or not takes the argument `causal: bool | None = None`. One
     that can take further inputs takes `inputs: Mapping[str, InputKind] | None = None`. If a recipe
@@ -82,7 +82,7 @@ class Denoiser(DynamicsModel):
     def forward(
         self, latents: Latent, sigma: Sigmas, conditioning: Conditioning, **inputs: Tensor
     ) -> Latent:
-        """Evaluate the network once. What its output means, e.g. a velocity, the objective says.
+        """Evaluate the network once. The objective defines the output, e.g. a velocity.
 
         Args:
             latents: noisy latents `[B, L, C, h, w]`; those of given frames are clean.
@@ -136,11 +136,11 @@ class Denoiser(DynamicsModel):
 
 
 class Predictor(DynamicsModel):
-    """A network that computes the frames after the given ones at once, without noise to remove.
+    """A network that computes the frames after the given ones directly, without denoising.
 
-    One that draws a future (`samples`) takes the further keyword ``generators`` in `forward`, in
+    One that samples a future (`samples`) takes the further keyword ``generators`` in `forward`, in
     `stream` and in `predict_states`: one CPU generator per clip, its only source of randomness. All
-    draw alike, so that the future stays the same one.
+    three sample the same future.
 
     One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
     which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
@@ -148,19 +148,19 @@ class Predictor(DynamicsModel):
 
     One that draws pictures from states (`follows_states`) gets them in every video frame
     `[B, T, S]`, in `state_loss` and `motion_loss`, and while it is trained, by the further keyword
-    ``states: Tensor | None`` of `forward`. Without them it has to know by itself.
+    ``states: Tensor | None`` of `forward`. Without them it estimates them.
 
     One that saves work if it need not return all frames (`skips`) takes the further keyword
     ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
     return, counted from the first predicted one.
 
-    One that knows how the scene's states go on (`predicts_states`) tells them in `predict_states`,
+    One that predicts the scene's states (`predicts_states`) returns them from `predict_states`,
     without drawing a picture.
 
     Attributes:
         streams: whether it implements `stream`, which is then the default mode of rollouts.
         skips: whether `forward` takes ``only``.
-        follows_states: whether `forward` takes ``states``, and all are of every video frame.
+        follows_states: whether `forward` takes ``states``, for every video frame.
         raw_states: whether it takes states as they were recorded, and not scaled to variance 1.
         predicts_states: whether it implements `predict_states`.
     """
@@ -185,9 +185,9 @@ class Predictor(DynamicsModel):
         """
 
     def state_loss(self, batch: Batch) -> Tensor:
-        """The loss of what it knows of the agent's `batch.states`, a scalar. Optional.
+        """The loss of its prediction of the agent's `batch.states`, a scalar. Optional.
 
-        States are known in training only; `forward` has to do without.
+        States are available in training only; `forward` does not get them.
         """
         raise RecipeError(f"{type(self).__name__} learns no states: leave out data.states")
 
@@ -211,11 +211,11 @@ class Predictor(DynamicsModel):
     def predict_states(self, given: Latent, conditioning: Conditioning, frames: int) -> Tensor:
         """The states in each video frame after the given ones, `[B, T, S]`. Optional.
 
-        In the units in which they were recorded; NaN where it knows none.
+        In the recorded units; NaN where unknown.
 
         Args:
             given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`, or `[1, K, C, h, w]` if all
-                clips begin alike.
+                clips have the same start.
             conditioning: the embedded actions of B clips.
             frames: length L of the clips, including the given frames.
         """

@@ -90,7 +90,7 @@ def checkpoint_to_resume(
     elif resume != AUTO:
         raise TrainingError(
             f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
-            "the folder and train anew"
+            "the folder and train again"
         )
     return last
 

@@ -1,4 +1,4 @@
-"""What the first of several processes decides before they train together, told to the others."""
+"""The first process decides whether a training can start, and informs the others."""
 
 from __future__ import annotations
 

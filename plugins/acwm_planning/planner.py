@@ -65,19 +65,19 @@ class Futures(ABC):
         """What these frames show, candidate after candidate, `[N · len(frames), …]`."""
 
     def predicted(self, frames: Sequence[int]) -> Observation | None:
-        """What the model itself says of these frames, as `observe` returns it; None if nothing.
+        """The model's predicted states of these frames, as an observation; None if it has none.
 
-        No picture is made for it. What it does not say raises `NotPredicted` when it is looked at.
+        No picture is made. States that it does not predict raise `NotPredicted` when accessed.
         """
         return None
 
     @abstractmethod
     def still(self, picture: Frame) -> Latent:
-        """The latent frame of a video in which `picture` stands still, `[1, 1, C, h, w]`."""
+        """The latent frame of a video that repeats `picture`, `[1, 1, C, h, w]`."""
 
 
 class Cost(ABC):
-    """Rates how far futures are from what a task asks for."""
+    """Rates the distance of futures from the goal of a task."""
 
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:

@@ -266,10 +266,12 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         note = f"{info.title} {scale.unit}".strip()
         rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))
     warnings = " ".join(f"{each[:1].upper()}{each[1:]}." for each in found.warnings)
-    caption = (
-        "Mean difference per episode on the clips that both predicted, with its 95 % interval. "
+    corrected = (
         f"Paired bootstrap over episodes; p-values corrected for {found.tests} comparisons (Holm), "
         "which keeps the rate of false alarms per table at 5 %. "
-        f"{warnings}"
+    )
+    caption = (
+        "Mean difference per episode on the clips that both predicted, with its 95 % interval. "
+        f"{corrected if found.tests else ''}{warnings}"
     )
     return Table("", columns, rows, "Runs", caption.strip(), "comparison")

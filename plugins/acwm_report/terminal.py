@@ -123,9 +123,9 @@ def _split_table(
 ) -> tuple[str, list[str], list[tuple[str, list[str]]]]:
     """Title, headings and rows of the scores of a split."""
     scores = summary.splits[split].scores
-    clips = f"{scores.clips} clips"
+    clips = _count(scores.clips, "clip")
     if scores.episodes != scores.clips:
-        clips += f" of {scores.episodes} episodes"
+        clips += f" of {_count(scores.episodes, 'episode')}"
     heads = [short_title(row) for row in scores.rows]
     shares = scores.shares.get("model", {})
     place = list(scores.rows).index("model") + 1
@@ -150,7 +150,7 @@ def _print_curves(summary: Summary) -> None:
         if result.steps:
             points = [(each.steps, each.scores[headline]) for each in result.steps.points]
             scores = (f"{steps}: {_text(score, interval=False)}" for steps, score in points)
-            about = f"{split} {headline} of {result.steps.clips} clips by sampling steps"
+            about = f"{split} {headline} of {_count(result.steps.clips, 'clip')} by sampling steps"
             click.echo(f"{about}  {'  '.join(scores)}")
     for split, result in summary.splits.items():
         if result.counterfactual:
@@ -158,7 +158,7 @@ def _print_curves(summary: Summary) -> None:
         if result.predictability:
             horizon = result.predictability.horizon
             until = "beyond the last frame" if horizon is None else f"frame {horizon}"
-            clips = f"{result.predictability.clips} clips, started a millimetre off"
+            clips = f"{_count(result.predictability.clips, 'clip')}, started a millimetre off"
             click.echo(f"{split}: predictability horizon: {until} ({clips})")
     for split, found in summary.ensembles.items():
         _print_ensemble(split, found)
@@ -174,7 +174,7 @@ def _print_ensemble(split: str, found: Ensemble) -> None:
     drawn = f"{found.draws} draws" if found.draws > 1 else "one prediction"
     click.echo(
         f"{split}: energy distance to the simulator's futures from {found.starts} starts, "
-        f"{1000 * found.moved:.2g} mm off, of {found.clips} clips ({drawn}): {away}"
+        f"{1000 * found.moved:.2g} mm off, of {_count(found.clips, 'clip')} ({drawn}): {away}"
     )
     apart = apart.replace(", half against half", "")
     click.echo(f"{split}: mean distance between two futures: {apart}")
@@ -186,7 +186,8 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
         gain, residual = found.gain["all"][row], found.residual["all"][row]
         if gain is not None and residual is not None:
             shown += f" (gain {gain:.2f}, residual {residual:.2f})"
-        branches = f"{found.branches} other action sequences in {found.clips} clips"
+        branches = _count(found.branches, "other action sequence")
+        branches += f" in {_count(found.clips, 'clip')}"
         click.echo(f"{split}: action response of {row}, {branches}: {shown}")
 
 
@@ -227,6 +228,10 @@ def about_published(summary: Summary) -> str:
     return "; ".join(facts) + (f". {row.note}" if row.note else "")
 
 
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"
+
+
 def print_comparison(comparison: Comparison) -> None:
     """Print which runs differ: a table per split, their usefulness, and warnings."""
     from rich.console import Console
@@ -236,10 +241,12 @@ def print_comparison(comparison: Comparison) -> None:
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
     print_tables(Console(highlight=False, markup=False), comparison, letters)
+    corrected = f"corrected for {_count(comparison.tests, 'comparison')} (Holm)"
+    if not comparison.tests:
+        corrected = "none, because there are too few episodes"
     click.echo(
         "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
-        "which the second is better; p is corrected for "
-        f"{comparison.tests} comparisons (Holm); better: significantly, p < 0.05"
+        f"which the second is better; p: {corrected}; better: significantly, p < 0.05"
     )
     _print_uses(Console(highlight=False, markup=False), comparison, letters)
     for warning in comparison.warnings:

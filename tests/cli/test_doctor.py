@@ -55,7 +55,7 @@ def test_engines_are_started_side_by_side_and_once_each(monkeypatch: pytest.Monk
     monkeypatch.setattr(type(catalog()), "registry", lambda self, kind: registry(kind))
     found = [finding for finding in doctor.findings() if finding.what.startswith("environment")]
     assert [each.what for each in found] == [f"environment {n}" for n in [*_names(), "a"]]
-    assert found[-1].note == "simulates; b, c use the same simulator"
+    assert found[-1].note == "simulates; same simulator as b, c"
     assert sorted(tried) == ["a", *_names()]
 
 

@@ -52,7 +52,7 @@ def test_a_curve_of_earlier_weights_asks_to_be_made_anew(swept, tmp_path):
     assert [older for _, older in outdated_curves(read)] == [True]
     page = page_of(run)
     assert CURVE not in page
-    assert "The curve of colour is left out, because it is of earlier weights" in page
+    assert "The curve of colour is left out, because it belongs to earlier weights" in page
     (command,) = re.findall(r"<code>(acwm evaluate .* --sweep .*)</code>", page)
     assert shlex.split(command) == ["acwm", "evaluate", str(run), "--sweep", VALUES]
 
@@ -62,5 +62,5 @@ def test_a_curve_of_later_weights_asks_for_the_rest_anew(swept, tmp_path):
     read = of_other_weights(run, "2999-01-01T00:00:00+00:00")
     assert [older for _, older in outdated_curves(read)] == [False]
     page = page_of(run)
-    assert "The curve of colour is left out, because it is of later weights" in page
-    assert f"make the rest anew with <code>acwm evaluate {run}</code>" in page
+    assert "The curve of colour is left out, because it belongs to later weights" in page
+    assert f"Update the rest with <code>acwm evaluate {run}</code>" in page

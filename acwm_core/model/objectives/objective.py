@@ -20,7 +20,7 @@ ModelT = TypeVar("ModelT", bound=DynamicsModel)
 
 
 class Objective(ABC, Generic[ModelT]):
-    """How a model learns from clips, and how it predicts what it has learned.
+    """How a model learns from clips, and how it predicts.
 
     An objective has neither weights nor state: its parameters come from the recipe, and the model
     is an argument of every method. Latents, actions and noise are those of whole clips; no method
@@ -32,12 +32,10 @@ class Objective(ABC, Generic[ModelT]):
     Attributes:
         trains: the class of the models that it trains, `Denoiser` or `Predictor`.
         causal: whether the model has to be causal in time.
-        inputs: what it gives a denoiser beside noisy latents and their noise levels: further
-            latents or levels, by name (`Denoiser.inputs`).
+        inputs: further latents or levels that it gives a denoiser, by name (`Denoiser.inputs`).
         steps: default number of network evaluations per prediction; None if there is no choice.
         learns_states: whether it trains on the agent's states too, see `Batch.states`.
-        draws: whether it trains predictors to draw one of several futures; they have to be able to
-            (`DynamicsModel.samples`).
+        draws: whether it trains stochastic predictors (`DynamicsModel.samples`).
     """
 
     trains: type[ModelT]

@@ -138,7 +138,7 @@ def _predicted(
     *,
     taught: bool = False,
 ) -> Latent:
-    """The predicted frames; with `taught`, a model that follows states is told the true ones."""
+    """The predicted frames; `taught` is teacher forcing, for models that follow states."""
     batch, known, *size = given.latents.shape
     further = _drawing(model, given.generators)
     if only is not None:
