@@ -322,7 +322,7 @@ def train_on(
             click.echo(f"step {step}, {time.monotonic() - began:.0f} s, dB: {training.told(names)}")
     state.unlink(missing_ok=True)
     tell_gain(kind(weights=str(out)), loaded, before)
-    click.echo(f"{out}; use it by codec={codec} codec.weights={out}")
+    click.echo(f"{out}; use it with codec={codec} codec.weights={out}")
 
 
 def _check_asked(out: Path, start: str, decoder_only: bool) -> None:

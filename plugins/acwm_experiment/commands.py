@@ -95,7 +95,7 @@ def experiment(
     command = (*COMMAND, "--trust-recipe") if recipes_are_trusted() else COMMAND
     if executor:
         count = submit_experiment(plan, command, executor, options, say=_say)
-        click.echo(f"{count} jobs submitted; --plan says how far they are")
+        click.echo(f"{count} jobs submitted; --plan shows their progress")
     else:
         _run(plan, command, jobs)
 

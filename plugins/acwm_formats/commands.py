@@ -90,7 +90,7 @@ def _print_facts(facts: dict[str, Any]) -> None:
         click.echo(f"recorded: {facts['source']['name']} ({facts['source']['kind']})")
         _print_notes(facts["source"])
     else:
-        click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as the splits say'}")
+        click.echo(f"seed {facts['seed']}, factors {facts['factors'] or 'as set by the splits'}")
         if facts["exploration"]:
             how = f"exploratory, shifted by up to {facts['shift']:g}"
             how = how if facts["shift"] else "exploratory"

@@ -35,7 +35,7 @@ class Step(NamedTuple):
     Attributes:
         what: what it does, for the terminal.
         seconds: how long it takes on two idle cores.
-        work: does it, unless it was done before; returns whether it was done now.
+        work: does it, unless it is already done; returns whether it did.
     """
 
     what: str
@@ -69,7 +69,7 @@ def demo(out: Path | None, quick: bool) -> None:
         if report.exists():
             return False
         write_report([shipped], report)
-        click.echo(f"open {report} now; the model that you train will join it", err=True)
+        click.echo(f"open {report} now; your own model will be added to it", err=True)
         return True
 
     def both() -> bool:
@@ -99,11 +99,11 @@ def _work_through(*steps: Step) -> None:
         pace = spent / expected if expected else 1.0
         minutes = max(1, round(pace * sum(each.seconds for each in steps[number:]) / 60))
         place = f"[{number + 1}/{len(steps)}]"
-        click.echo(f"{place} {step.what}; about {minutes} min left in all", err=True)
+        click.echo(f"{place} {step.what}; about {minutes} min left", err=True)
         started = time.monotonic()
         done = step.work()
         seconds = time.monotonic() - started
-        click.echo(f"{place} {f'took {seconds:.0f} s' if done else 'was done before'}", err=True)
+        click.echo(f"{place} {f'took {seconds:.0f} s' if done else 'already done'}", err=True)
         if done:
             spent, expected = spent + seconds, expected + step.seconds
 

@@ -28,7 +28,7 @@ def test_demo_runs_and_goes_on(tmp_path: Path) -> None:
 
     again = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert again.exit_code == 0
-    assert again.stderr.count("was done before") == 6  # all but the last page
+    assert again.stderr.count("already done") == 6  # all but the last page
     assert again.stdout == first.stdout
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == weights
 
@@ -61,7 +61,7 @@ def test_the_time_left_is_that_of_all_steps(monkeypatch, capsys):
     )
     told = [line for line in capsys.readouterr().err.splitlines() if "left" in line]
     assert [line.split("about ")[1] for line in told] == [
-        f"{minutes} min left in all" for minutes in (7, 5, 8)
+        f"{minutes} min left" for minutes in (7, 5, 8)
     ]
 
 

@@ -40,7 +40,7 @@ def test_jobs_wait_for_one_another_and_survive_a_preemption(acwm, cluster, whole
     options = ["executor.sbatch=--partition=gpu", "executor.steps.train=--time=1:00 --mem=4G"]
     code, out, err = acwm("experiment", "widths.yaml", *SLURM, *options, cwd=ours)
     assert code == 0, err
-    assert out == f"{STEPS} jobs submitted; --plan says how far they are\n"
+    assert out == f"{STEPS} jobs submitted; --plan shows their progress\n"
     train, evaluate = job_of(ours, "train-tiny-0"), job_of(ours, "evaluate-tiny-0")
     simulate = job_of(ours, "simulate-data_square")
     asked = slurm.options(cluster, train)
