@@ -104,12 +104,12 @@ class _ExperimentTables:
                 grids = (self._grid.cells(published_scores(each)) for each in quoted)
                 rows.append(Row("published", list(chain(*grids)), group=group, muted=True))
         caption = (
-            f"{experiment.caption} Mean over seeds, its deviation over seeds (±) and its 95 % "
+            f"{experiment.caption} Mean over seeds, standard deviation over seeds (±) and 95 % "
             f"interval over seeds and episodes. {CAPTION}"
         )
         for source in list(self._quoted.values())[:1]:
             where = f"{source.citation}, {source.label}"
-            caption += f" In grey, {where}: measured on data of their own. {source.note}"
+            caption += f" In grey, {where}: measured on other data. {source.note}"
         return self._table(experiment.title, rows, caption.strip(), experiment.name)
 
     def differences(self) -> Table | None:
@@ -127,8 +127,8 @@ class _ExperimentTables:
         if not rows:
             return None
         caption = (
-            f"Beyond {first}, on the same clips: mean difference with its 95 % interval over seeds "
-            "and episodes. An interval without 0 is larger than chance alone makes one in twenty."
+            f"Difference to {first} on the same clips: mean with its 95 % interval over seeds and "
+            "episodes. Without 0 in the interval, the difference is significant at 5 %."
         )
         title = f"{self.experiment.title}: against {first}"
         return self._table(title, rows, caption, f"{self.experiment.name}_differences")

@@ -95,7 +95,7 @@ def collect(folder: Path) -> Collection:
             boards_of({name: summary})  # old files may lack what they need
             entry_facts(name, summary, entry)
         except KeyError as error:
-            found.broken[file] = f"it lacks {error}"
+            found.broken[file] = f"{error} is missing"
         except DAMAGE as error:
             found.broken[file] = str(error).removeprefix(f"{path} ").removeprefix("is ")
         else:

@@ -65,7 +65,7 @@ class PlanVideo:
         if widest is None:
             return ""
         frame, gap = widest
-        return f"wrong by up to {scale.number(gap)} {scale.unit}, after {frame} actions"
+        return f"model error up to {scale.number(gap)} {scale.unit}, after {frame} actions"
 
     @property
     def drawing(self) -> CurveDrawing:

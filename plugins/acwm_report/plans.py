@@ -14,19 +14,19 @@ from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import MISSING, PERCENT, Cell, Column, Row, Scale, Table
 
 CAPTION = (
-    "Intervals of shares are exact (Clopper and Pearson), those of distances bootstrap intervals "
-    "over episodes; p is of McNemar’s exact test against the first row."
+    "Intervals of shares are exact (Clopper and Pearson), those of distances are bootstrapped over "
+    "episodes; p is from McNemar’s exact test against the first row."
 )
 
 
 ROWS = {
     "model": ("Planning with the model", "the result; other rows are baselines"),
-    "simulator": ("Planning with the simulator", "the same planner and cost: the upper bound"),
-    "codec": ("Simulator, seen through the codec", "states are read from its reconstructions"),
-    "solution": ("Scripted solution", "it looks at the simulator"),
-    "policy": ("Behaviour policy", "it made the data and knows no goal"),
+    "simulator": ("Planning with the simulator", "same planner and cost: upper bound"),
+    "codec": ("Simulator through the codec", "states read from reconstructions"),
+    "solution": ("Scripted solution", "uses the simulator’s state"),
+    "policy": ("Behaviour policy", "made the data; knows no goal"),
     "random": ("Random actions", "each as long as a block"),
-    "still": ("Nothing", "no motion"),
+    "still": ("No motion", "the action for no motion"),
 }
 """Title and explanation of each way to act."""
 
@@ -59,7 +59,7 @@ def plan_table(found: PlanTable) -> Table:
     rows = [_row(row, scale) for row in found.rows]
     head = f"{found.task} · {max((row.episodes for row in found.rows), default=0)} episodes"
     name = f"plans-{found.task}"
-    return Table(head, _columns(scale.unit), rows, "Who acts", CAPTION, name)
+    return Table(head, _columns(scale.unit), rows, "Controller", CAPTION, name)
 
 
 def task_tables(experiment: Experiment | None) -> list[Table]:
@@ -74,11 +74,11 @@ def task_tables(experiment: Experiment | None) -> list[Table]:
         made = [plan for plan in tasks if plan.progress()]
         caption = "" if experiment is None or experiment.cells else experiment.caption
         missing = ", ".join(plan.row for plan in tasks if plan not in made)
-        words = (caption, CAPTION, missing and f"Not played yet: {missing}.")
+        words = (caption, CAPTION, missing and f"Not run yet: {missing}.")
         rows = [row for plan in made for row in _task_rows(plan)]
         if rows:
             text = " ".join(filter(None, words))
-            tables.append(Table(title, _columns(), rows, "Who acts", text, f"plans-{title}"))
+            tables.append(Table(title, _columns(), rows, "Controller", text, f"plans-{title}"))
     return tables
 
 
@@ -92,7 +92,7 @@ def _task_rows(plan: PlanningJob) -> list[Row]:
 def _columns(unit: str = "") -> list[Column]:
     """The columns of a table of plans; without a `unit` of distances, each cell has its own."""
     solved = Column("Solved"), Column("Share", PERCENT.unit, better="↑")
-    distances = Column("Final distance", unit, better="↓"), Column("At the start", unit)
+    distances = Column("Final distance", unit, better="↓"), Column("Initial distance", unit)
     efforts = Column("Seconds per decision"), Column("Rollouts per decision")
     return [*solved, *distances, Column("p"), *efforts]
 

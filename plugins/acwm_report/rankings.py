@@ -50,12 +50,11 @@ def ranking_table(ranking: Ranking) -> Table:
         ""
         if choices is None
         else (
-            f"Choosing among action sequences as the model would loses "
-            f"{_text(choices.regret.value)} {ranking.unit} per action, at random "
-            f"{_text(choices.chance.value)}, over {choices.starts} starts. "
+            f"Decision regret: {_text(choices.regret.value)} {ranking.unit} per action by the model's "
+            f"choice, {_text(choices.chance.value)} at random, over {choices.starts} starts. "
         )
     )
-    caption = f"{lost}{_unread(ranking)}Returns are minus sums of distances in {ranking.unit}."
+    caption = f"{lost}{_unread(ranking)}Returns are negative sums of distances in {ranking.unit}."
     head = f"{ranking.task} · {len(ranking.policies)} policies, {ranking.episodes} episodes of each"
     return Table(head, columns, rows, "Judged by", caption, f"policies-{ranking.task}")
 
@@ -75,7 +74,7 @@ def ranking_charts(run: EvaluatedRun) -> list[Chart]:
 
 
 def _unread(ranking: Ranking) -> str:
-    """A sentence on the episodes in which the estimator read no distance; empty if none."""
+    """A sentence on the episodes without an estimated distance; empty if none."""
     pictures = {"model": "predictions", "estimator": "true pictures"}
     counts = {judge: sum(p.unread.get(judge, 0) for p in ranking.policies) for judge in pictures}
     counted = [f"{count} of {pictures[judge]}" for judge, count in counts.items() if count]
@@ -83,8 +82,8 @@ def _unread(ranking: Ranking) -> str:
         return ""
     episodes = len(ranking.policies) * ranking.episodes
     return (
-        f"The estimator read no distance in {' and '.join(counted)}, of {episodes} episodes each; "
-        "there it counts as at the start. "
+        f"The estimator found no distance in {' and '.join(counted)}, of {episodes} episodes each; "
+        "these count with the initial distance. "
     )
 
 

@@ -80,7 +80,7 @@ def test_a_table_of_plans_stands_on_the_page_and_in_files(planned, tmp_path):
     names = {path.name: path for path in export_report([planned], tmp_path / "out")}
     (csv,) = [n for n in names if n.startswith("plans-") and n.endswith(".csv")]
     head, first, second = names[csv].read_text().splitlines()
-    assert head.startswith("Who acts,note,Solved,Share,Share_low,Share_high,Final distance,")
+    assert head.startswith("Controller,note,Solved,Share,Share_low,Share_high,Final distance,")
     assert "0.75," in first
     assert second.startswith("Nothing,no motion,0.0,0.0,0.0,")
 
@@ -89,7 +89,7 @@ def test_a_film_shows_where_the_plan_went_wrong(planned):
     text = write_report([planned]).read_text()
     assert text.count("data:video/mp4;base64,") == 1
     assert "Episode 1, not solved after 3 actions" in text
-    assert "wrong by up to 25.0 cm, after 3 actions" in text
+    assert "model error up to 25.0 cm, after 3 actions" in text
     run = EvaluatedRun.read(planned, "run1")
     assert [len(each) for each in plan_videos([run], VideoRoom(1))] == [1]
     assert plan_videos([run], VideoRoom(0.0001)) == [[]]

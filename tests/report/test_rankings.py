@@ -70,8 +70,8 @@ def test_episodes_that_no_picture_tells_are_counted(mine, first, second, told):
     policies = [replace(p, unread=n) for p, n in zip(found.policies, (first, second), strict=True)]
     write_json(mine / "ranking" / "place" / RANKING_FILE, replace(found, policies=policies))
     (table,) = ranking_tables(EvaluatedRun.read(mine, "run1"))
-    assert ("The estimator read no distance" in table.caption) == (told is not None)
-    assert told is None or f"The estimator read no distance {told}" in table.caption
+    assert ("The estimator found no distance" in table.caption) == (told is not None)
+    assert told is None or f"The estimator found no distance {told}" in table.caption
 
 
 def test_one_of_other_weights_or_none_is_not(mine):

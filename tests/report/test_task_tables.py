@@ -48,7 +48,7 @@ def test_all_worlds_stand_in_one_table(two, tmp_path):
     for heading in ("One · place", "Two · place"):
         assert f'colspan="8">{heading}</th>' in page
     assert "What it is. Intervals of shares are exact" in page
-    assert "Not played yet: Three." in page
+    assert "Not run yet: Three." in page
     assert "45.0 cm" in page
     assert "Videos: All worlds · One" in page
     assert page.count("data:video/mp4;base64,") == 2
@@ -56,7 +56,7 @@ def test_all_worlds_stand_in_one_table(two, tmp_path):
     (csv,) = [path for path in files if path.suffix == ".csv"]
     assert csv.name == "plans-All worlds.csv"
     lines = csv.read_text().splitlines()
-    assert lines[0].startswith("group,Who acts,note,Solved,Share,Share_low,Share_high,Final dist")
+    assert lines[0].startswith("group,Controller,note,Solved,Share,Share_low,Share_high,Final dist")
     assert [line.split(",")[0] for line in lines[1:]] == ["One · place"] * 2 + ["Two · place"] * 2
 
 
@@ -64,8 +64,8 @@ def test_rows_that_nobody_asked_for_and_other_settings_are_not_shown(two, tmp_pa
     fewer = task(two[0], "One", rows=("model",))
     other = PlanningJob(**{**vars(task(two[1], "Two")), "settings": {"planner": {"name": "cem"}}})
     page = write_report([], tmp_path / "page.html", experiment=experiment(fewer, other)).read_text()
-    assert "Nothing" not in page
-    assert "Not played yet: Two." in page
+    assert "the action for no motion" not in page
+    assert "Not run yet: Two." in page
 
 
 def test_videos_of_a_run_on_the_page_are_shown_once(two, tmp_path):
