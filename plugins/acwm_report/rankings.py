@@ -50,7 +50,7 @@ def ranking_table(ranking: Ranking) -> Table:
         ""
         if choices is None
         else (
-            f"Decision regret: {_text(choices.regret.value)} {ranking.unit} per action by the model's "
+            f"Regret: {_text(choices.regret.value)} {ranking.unit} per action by the model’s "
             f"choice, {_text(choices.chance.value)} at random, over {choices.starts} starts. "
         )
     )
