@@ -50,7 +50,7 @@ class Finding(NamedTuple):
 
 @click.command()
 def doctor() -> int:
-    """Test the installation and say what to install.
+    """Test the installation and advise what to install.
 
     Starts an environment of every simulator in its own process. Exit code 1 if something that is
     installed does not work.

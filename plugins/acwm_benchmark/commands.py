@@ -47,10 +47,10 @@ def benchmark() -> None:
 )
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 def export(words: tuple[str, ...], out: Path, **others: Any) -> None:
-    """Write the tasks of WORLDs: first frames and actions, and nothing of the truth.
+    """Write the tasks of WORLDs: first frames and actions, without the ground truth.
 
-    They are all test clips of both splits, and other actions from the same first frames. Without a
-    WORLD, all datasets in --data, or else all environments. OVERRIDES set the evaluation:
+    The tasks are all test clips of both splits, and other actions from the same first frames.
+    Without a WORLD, all datasets in --data, or else all environments. OVERRIDES set the evaluation:
     evaluation.context_frames=5, evaluation.protocol=acwm-phys.
     """
     from acwm_core.plugins import catalog
@@ -81,10 +81,10 @@ def export(words: tuple[str, ...], out: Path, **others: Any) -> None:
 @click.option("--overwrite", is_flag=True, help="Replace results of other tasks or settings.")
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 def score(predictions: Path, worlds: tuple[str, ...], tasks: Path, **others: Any) -> None:
-    """Score PREDICTIONS of tasks, whatever program made them.
+    """Score PREDICTIONS of tasks by any program.
 
-    Everything that `acwm evaluate` measures without a network. Reports, comparisons and
-    leaderboards take OUT/WORLD like a run.
+    Measures everything that `acwm evaluate` measures without a network. Reports, comparisons and
+    leaderboards accept OUT/WORLD like a run.
     """
     from acwm_benchmark.score import score_predictions
     from acwm_report.terminal import print_summary

@@ -41,8 +41,8 @@ def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.
 
     Starts from the first frame of an episode and uses its actions. The video shows truth |
-    prediction | difference, or only the prediction with --actions or --image. With --samples, draws
-    stand side by side after the truth.
+    prediction | difference, or only the prediction with --actions or --image. With --samples, the
+    truth and several samples are side by side.
     """
     from acwm_dream.rollout import rollout_run
 

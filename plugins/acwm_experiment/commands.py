@@ -54,7 +54,7 @@ def experiment(
     jobs: int,
     executor: str | None,
 ) -> None:
-    """Simulate, train, evaluate, plan and report all that FILE lists.
+    """Simulate, train, evaluate, plan and report everything in FILE.
 
     FILE is an experiment: a table of recipes, such as ablations/conditioning or its small version
     ablations/conditioning_small. OVERRIDES change all recipes, as in `acwm fit`, or set

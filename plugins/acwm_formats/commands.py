@@ -239,7 +239,7 @@ def import_format(
 ) -> None:
     """Import recordings in another format as a dataset.
 
-    Without FORMAT or --format FORMAT, the format is found out from the files. If it is interrupted,
+    Without FORMAT or --format FORMAT, the format is detected from the files. If it is interrupted,
     run the same command again to continue.
     """
     from acwm_formats.recordings import import_dataset

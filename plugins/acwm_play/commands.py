@@ -42,9 +42,9 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
     """Play with the model of RUN beside the simulator, in a browser.
 
     Both start from the same frame and get your actions, by keyboard, mouse, touch or gamepad.
-    Beside a model of recorded data is the recorded video, which goes its own way.
+    A model of recorded data has the recorded video beside it, which does not follow your actions.
     Several runs make a menu; without RUN, it shows the installed trained models. Only this machine
-    can open the page. Ctrl-C ends it.
+    can open the page. Ctrl-C stops it.
     """
     wait_without_spinning()
     from acwm_play.serve import serve

@@ -94,7 +94,7 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
     """Write the report of evaluated runs.
 
     One self-contained HTML file with tables, curves and videos. Several runs are compared. An
-    experiment's folder stands for its evaluated runs. --export writes the tables as CSV, Markdown
+    experiment's folder means its evaluated runs. --export writes the tables as CSV, Markdown
     and LaTeX, and the figures as PNG and PDF.
     """
     from acwm_experiment.table import Experiment, is_experiment

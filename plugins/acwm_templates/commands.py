@@ -20,8 +20,8 @@ from acwm_templates.kinds import KINDS
 def new(kind: str, name: str, out: Path | None, environment: str) -> None:
     """Start a plugin of your own.
 
-    Writes a package with a component called NAME (in snake_case) and tests. It works as it is;
-    change it piece by piece. KIND is one of:
+    Writes a working package with a component called NAME (in snake_case) and tests; change it
+    piece by piece. KIND is one of:
 
     \b
       environment   a world simulated and drawn with numpy

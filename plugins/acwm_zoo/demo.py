@@ -47,7 +47,7 @@ class Step(NamedTuple):
 @click.option("--out", type=OUT_FOLDER, help="Folder for all files.")
 @click.option("--quick", is_flag=True, help="A test of about a minute; the model learns nothing.")
 def demo(out: Path | None, quick: bool) -> None:
-    """Simulate, train, evaluate and report, at once.
+    """Simulate, train, evaluate and report in one go.
 
     Takes about nine minutes on two CPU cores: shows the trained model that ships beside the
     simulator, then simulates a small dataset, trains a world model, evaluates it and adds it to
