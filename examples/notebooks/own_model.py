@@ -125,5 +125,5 @@ for name, shown in (("prediction", predicted), ("first frame alone", video[:1]))
     print(f"{name}: {-10 * torch.log10(error):.1f} dB")
 
 # %% [markdown]
-# Put the class into a package (the guide "A model of your own" shows how), and the command line
+# Put the class into a package (the guide "Write a model" shows how), and the command line
 # trains it with all the other features of acwm: `acwm fit reacher +small model=next_frame`.

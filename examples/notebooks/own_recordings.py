@@ -2,10 +2,10 @@
 # # Your own recordings
 
 # %% [markdown]
-# From camera files to a model that was judged, with nothing but videos and tables. The recordings
-# are made here, without acwm: a pendulum of Gymnasium is filmed at 15 frames per second, and a
-# table beside each video says which torque its motor had, and when. It takes some minutes of a
-# laptop's CPU, and `pip install pygame`, which draws the pendulum.
+# From videos and tables to an evaluated model. The recordings are made here, without acwm: a
+# Gymnasium pendulum is filmed at 15 frames per second, and a table beside each video has the
+# torque of its motor and the time. This takes some minutes of a laptop's CPU, and
+# `pip install pygame`, which draws the pendulum.
 
 # %%
 import csv
@@ -23,16 +23,15 @@ from PIL import Image
 
 import acwm
 
-# A check of this notebook itself, with fewer recordings and a model that learns nothing
+# A quick check of this notebook, with fewer recordings and a model that learns nothing
 QUICK = "QUICK" in os.environ
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame opens no window
 
 # %% [markdown]
 # ## Record
 #
-# This is the part that your camera and your robot have done already. The pendulum starts at rest,
-# and its motor does something else in every frame. We hide the arrow by which Gymnasium shows the
-# torque.
+# Your camera and your robot have already done this part. The pendulum starts at rest, and the
+# torque of its motor changes in every frame. We hide the arrow with which Gymnasium shows it.
 
 
 # %%
@@ -68,7 +67,7 @@ def save(path, film, torques):
 
 
 # %% [markdown]
-# We film with two cameras. The second one passes each picture on one frame late, as cheap ones do.
+# We use two cameras. The second one delivers each picture one frame late, as cheap ones do.
 
 # %%
 for take in range(40 if QUICK else 80):
@@ -98,19 +97,18 @@ run("data import videos takes --size 64 --out data/pendulum")
 
 # %% [markdown]
 # The marked lines are the short form of `acwm data report data/pendulum`. The one about actions
-# matters most: the video follows them, and does so at once. The repeated frames are of moments in
-# which the pendulum turns round.
+# matters most: the video follows them without delay. Repeated frames occur where the pendulum
+# reverses.
 #
-# ## A camera that is late
+# ## A camera with a delay
 #
-# Now the second camera. Its files are as sound as those of the first, but nothing in them answers
-# an action before the next frame.
+# Now the second camera. Its files are valid, but the effect of an action appears one frame late.
 
 # %%
 run("data import videos late --size 64 --out data/late")
 
 # %% [markdown]
-# The delay is found, and `--shift 1` moves each action to the frame that it belongs to.
+# The delay is detected, and `--shift 1` moves each action to the frame where it belongs.
 
 # %%
 run("data import videos late --size 64 --shift 1 --out data/repaired")
@@ -118,17 +116,17 @@ run("data import videos late --size 64 --shift 1 --out data/repaired")
 # %% [markdown]
 # ## Train
 #
-# `small` is a recipe that a laptop's CPU trains, in 3,000 steps.
+# The recipe `small` trains on a laptop's CPU, in 3,000 steps.
 
 # %%
 steps = "trainer.max_steps=2" if QUICK else ""
 run(f"fit small data.path=data/pendulum {steps} --out runs/pendulum")
 
 # %% [markdown]
-# ## Judge
+# ## Evaluate
 #
-# The recordings that were kept for testing are predicted from their first frame, with their own
-# actions, and with those of another recording. A model that uses its actions is worse with those.
+# Test recordings are predicted from their first frame, with their own actions and with those of
+# another recording. A model that uses its actions is worse with the latter.
 
 # %%
 run("evaluate runs/pendulum")

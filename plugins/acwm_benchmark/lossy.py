@@ -97,7 +97,7 @@ class LossyVideo:
         name = {"dav1d": "av1", "vpx-vp9": "vp9", "aom-av1": "av1"}.get(name, name)
         if name != "gif" and name not in ENCODERS:
             raise DataError(
-                f"{sample} is coded by {coding}, whose loss cannot be measured: hand in H.264, or "
+                f"{sample} is coded by {coding}, whose loss cannot be measured: submit H.264, or "
                 "PNG or NPZ, which lose nothing"
             )
         self.encoder = ENCODERS.get(name)

@@ -69,8 +69,8 @@ A world model of `{environment.name}`: from the first frames and actions it pred
 {_curve(folder.metrics)}
 ## How good it is
 
-{_episodes(summary)}, as the weights are stored here, with 95 % intervals. `acwm evaluate {name}`
-makes the same numbers again.
+{_episodes(summary)}, with the stored weights and 95 % intervals. `acwm evaluate {name}`
+reproduces them.
 
 {_scores(summary)}
 {_ceilings(summary)}"""
