@@ -26,7 +26,7 @@ ROWS = {
     "solution": ("Scripted solution", "uses the simulator’s state"),
     "policy": ("Behaviour policy", "made the data; knows no goal"),
     "random": ("Random actions", "each as long as a block"),
-    "still": ("No motion", "the action for no motion"),
+    "still": ("No motion", ""),
 }
 """Title and explanation of each way to act."""
 

@@ -82,7 +82,7 @@ def test_a_table_of_plans_stands_on_the_page_and_in_files(planned, tmp_path):
     head, first, second = names[csv].read_text().splitlines()
     assert head.startswith("Controller,note,Solved,Share,Share_low,Share_high,Final distance,")
     assert "0.75," in first
-    assert second.startswith("Nothing,no motion,0.0,0.0,0.0,")
+    assert second.startswith("No motion,,0.0,0.0,0.0,")
 
 
 def test_a_film_shows_where_the_plan_went_wrong(planned):
