@@ -50,7 +50,7 @@ def test_a_table_is_made_and_gone_on_with(mine, capsys):
     assert summary["planner"]["candidates"] == 6
     page = (folder / "index.html").read_text()
     assert all(f'src="videos/{row}-0000.mp4"' in page for row in ROW_NAMES)
-    assert re.search(r">Nothing<.*?<td[^>]*>0/2<", page, re.DOTALL)
+    assert re.search(r">No motion<.*?<td[^>]*>0/2<", page, re.DOTALL)
     videos = sorted(path.name for path in (folder / "videos").iterdir())
     assert videos == sorted(f"{row}-0000.{kind}" for row in ROW_NAMES for kind in ("mp4", "json"))
     assert summary["unit"] == "px"
