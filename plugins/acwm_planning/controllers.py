@@ -6,7 +6,8 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from acwm_core.env.task import Goal, Task
 from acwm_core.errors import PluginError, check_shape
 from acwm_planning.futures import GoalCost, History
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
-from acwm_planning.scripts import Script
+from acwm_planning.scripts import check_bounds, script
 from acwm_planning.search import SearchPlanner
 
 Actions = Sequence[NDArray[np.float32]]
@@ -68,28 +69,6 @@ class RandomController(Controller):
         return [np.clip(action, low, high)] * self._block
 
 
-class ScriptedController(Controller):
-    """The behaviour policy, which does not know the goal, or the task's own solution.
-
-    Args:
-        solves: use the solution instead of the behaviour policy.
-    """
-
-    def __init__(self, *, solves: bool) -> None:
-        self._solves = solves
-
-    def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
-        self._action = environment.card.action
-        self._script = Script.begin(environment, task, goal, solves=self._solves)
-
-    def act(self, history: History) -> Actions:
-        """One action, because the script looks at the simulator before each action."""
-        script, action = self._script, self._script.act()
-        bounds = np.array(self._action.low), np.array(self._action.high)
-        check_bounds(script.owner, script.method, action, *bounds)
-        return [action.astype(np.float32)]
-
-
 class PolicyController(Controller):
     """Asks a policy that looks at the simulator before each action.
 
@@ -99,6 +78,11 @@ class PolicyController(Controller):
 
     def __init__(self, create: Callable[[Environment, Task, Goal], Policy]) -> None:
         self._create = create
+
+    @classmethod
+    def scripted(cls, *, solves: bool) -> PolicyController:
+        """Follows the behaviour policy, which does not know the goal, or the task's solution."""
+        return cls(partial(script, solves=solves))
 
     @classmethod
     def replaying(cls, actions: Iterable[NDArray[np.float32]]) -> PolicyController:
@@ -230,25 +214,3 @@ class PlanningController(Controller):
         check_shape(self._planner, "plan", actions, -1, len(self._low))
         check_bounds(self._planner, "plan", actions, self._low.numpy(), self._high.numpy())
         return actions
-
-
-def check_bounds(
-    component: object,
-    method: str,
-    actions: NDArray[Any],
-    low: NDArray[Any],
-    high: NDArray[Any],
-) -> None:
-    """Refuse actions `[…, A]` that are not valid for the environment.
-
-    Raises:
-        PluginError: an action is not finite, or out of bounds by more than rounding.
-    """
-    slack = 1e-6 * (high - low)
-    wrong = ~((actions >= low - slack) & (actions <= high + slack))
-    if wrong.any():
-        value = actions[wrong][0]
-        bounds = f"from {[*map(float, low)]} to {[*map(float, high)]}"
-        raise PluginError(
-            f"{type(component).__name__}.{method} gives {value:g}, not actions {bounds}"
-        )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import RecipeError
 from acwm_core.files import writing, written_whole
-from acwm_planning.controllers import PlanningController, ScriptedController
+from acwm_planning.controllers import PlanningController, PolicyController
 from acwm_planning.episode import play, spec_of_seed, start_of
 from acwm_planning.futures import GoalCost, History
 from acwm_planning.run import EpisodePlayer, make_cost, make_planner
@@ -87,7 +87,7 @@ def _solved_so_far(
     still = environment.environment.still_action()
     ahead = getattr(planner, "horizon", 1) * getattr(planner, "action_block", 1)
     steps = MOMENT + max(ahead, planner.actions_per_plan)
-    solution = play(environment, spec, ScriptedController(solves=True), steps=steps)
+    solution = play(environment, spec, PolicyController.scripted(solves=True), steps=steps)
     frames = solution.history.frames[: MOMENT + 1]
     history = History(spec, frames, solution.history.actions[:MOMENT])
     return history, solution.actions[MOMENT:], still

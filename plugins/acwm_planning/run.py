@@ -22,8 +22,8 @@ from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.controllers import (
     Controller,
     PlanningController,
+    PolicyController,
     RandomController,
-    ScriptedController,
     StillController,
 )
 from acwm_planning.episode import (
@@ -90,7 +90,7 @@ class EpisodePlayer:
         if row == "random":
             return RandomController(getattr(planner, "action_block", planner.actions_per_plan))
         if row in ("policy", "solution"):
-            return ScriptedController(solves=row == "solution")
+            return PolicyController.scripted(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulator_rollouts(row == "codec")
         cost = make_cost(self.settings)
         return PlanningController(planner, rollouts, cost, action_std=self._action_std)

@@ -11,8 +11,8 @@ from acwm_core.data.simulate import simulate
 from acwm_core.errors import RecipeError
 from acwm_planning.controllers import (
     PlanningController,
+    PolicyController,
     RandomController,
-    ScriptedController,
     StillController,
 )
 from acwm_planning.costs import StateDistance
@@ -165,11 +165,11 @@ def test_seen_through_the_codec_states_are_those_of_the_reconstruction():
 
 
 def test_scripts_and_chance_act_as_they_say():
-    solved = played(ScriptedController(solves=True), 0)
+    solved = played(PolicyController.scripted(solves=True), 0)
     assert solved.success
     with pytest.raises(NoSolutionError, match="'shy' has no scripted solution"):
-        played(ScriptedController(solves=True), 0, tiny.SHY)
-    policy = played(ScriptedController(solves=False), 0)
+        played(PolicyController.scripted(solves=True), 0, tiny.SHY)
+    policy = played(PolicyController.scripted(solves=False), 0)
     steps = np.stack(policy.history.actions)
     recorded = simulate(tiny.Slide(), tiny.spec(0)).actions
     assert np.array_equal(steps, recorded[: len(steps)])  # the data's own behaviour

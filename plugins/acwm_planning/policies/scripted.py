@@ -12,8 +12,8 @@ import numpy as np
 from acwm_core.env.environment import Environment, Policy
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import PluginError, RecipeError, suggest
-from acwm_planning.scripts import NoSolutionError, Script
+from acwm_core.errors import RecipeError, suggest
+from acwm_planning.scripts import NoSolutionError, script
 
 ScriptName = Literal["solution", "behaviour"]
 
@@ -63,7 +63,8 @@ class ScriptedPolicy:
             NoSolutionError: the task has no solution.
         """
         spec, action = environment.episode_spec, environment.card.action
-        script = Script.begin(environment, task, goal, solves=self.script == "solution")
+        solves = self.script == "solution"
+        act = script(environment, task, goal, solves=solves, bounded=False)
         rng = spec.rng(f"policy:{self.name}")
         low, high = np.array(action.low, np.float32), np.array(action.high, np.float32)
         side = EpisodeSpec(environment.card.name).rng("bias").choice([-1.0, 1.0], len(low))
@@ -72,10 +73,7 @@ class ScriptedPolicy:
 
         def disturbed() -> np.ndarray:
             still = environment.still_action()
-            intended = script.act().astype(np.float64)
-            if not np.isfinite(intended).all():
-                owner = type(script.owner).__name__
-                raise PluginError(f"{owner}.{script.method} gives numbers not finite")
+            intended = act().astype(np.float64)
             pushed = self.noise * next(noise) + self.bias * side
             raw = still + self.skill * (intended - still) + pushed * (high - low) / 2
             return np.clip(raw.astype(np.float32), low, high)
@@ -127,7 +125,7 @@ def parse_policy(text: str) -> ScriptedPolicy:
 def is_solvable(environment: Environment, task: Task, goal: Goal) -> bool:
     """Whether the task has a scripted solution from the environment's current state."""
     try:
-        Script.begin(environment, task, goal, solves=True)
+        script(environment, task, goal, solves=True)
     except NoSolutionError:
         return False
     return True
