@@ -4,6 +4,7 @@ Test processes run side by side, one per core; threads of small networks that wa
 make them many times slower.
 """
 
+import gc
 import os
 import random
 import signal
@@ -45,6 +46,17 @@ def pytest_configure(config):
     """In a run of many tests, workers are forked from a process that has imported what is slow."""
     if hasattr(config, "workerinput"):
         start_server()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Imports make millions of objects that stay: the garbage collector need not search them."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers

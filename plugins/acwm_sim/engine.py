@@ -3,8 +3,10 @@
 import contextlib
 import functools
 import io
+import linecache
 import operator
 import os
+import sys
 import tempfile
 import threading
 import warnings
@@ -49,6 +51,19 @@ def _position(self: Any, node: Any) -> str:
 
 
 ASTTransformerContext.get_pos_info = _position
+
+
+def _inside_class(level_of_class_stackframe: int) -> bool:
+    """Whether the statement of the frame that many levels up begins a class.
+
+    Taichi asks at each decorator, by a function that searches all imported modules.
+    """
+    frame = sys._getframe(level_of_class_stackframe)
+    line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
+    return any(pattern.match(line) for pattern in kernel_impl._KERNEL_CLASS_STACKFRAME_STMT_RES)
+
+
+kernel_impl._inside_class = _inside_class
 
 _started_in: int | None = None
 

@@ -104,3 +104,34 @@ print(triple(2.0))
     result = run(code, PYTHONPATH=str(tmp_path), TI_OFFLINE_CACHE_FILE_PATH=str(cache))
     assert result.stdout == "6.0\n", result.stderr
     assert [*cache.rglob("*.tic")]
+
+
+def test_kernels_of_classes_are_found_as_taichi_finds_them(tmp_path, monkeypatch):
+    """Taichi tells by a decorator's line whether what it decorates is a method."""
+    (tmp_path / "counting.py").write_text("""
+from acwm_sim.engine import ti
+
+@ti.data_oriented
+class Counter:
+    def __init__(self):
+        self.step = 2
+
+    @ti.kernel
+    def count(self, times: int) -> int:
+        total = 0
+        for _ in range(times):
+            total += self.step
+        return total
+
+@ti.kernel
+def triple(x: int) -> int:
+    return 3 * x
+""")
+    code = """
+from acwm_sim import engine
+engine.start()
+from counting import Counter, triple
+print(Counter().count(4), triple(4))
+"""
+    result = run(code, PYTHONPATH=str(tmp_path))
+    assert result.stdout == "8 12\n", result.stderr
