@@ -1,4 +1,4 @@
-"""`Estimator`: reads an environment with the network that was trained for it."""
+"""Estimators that read a world with a network that was trained for it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Observation, Physics, StateEstimator
-from acwm_core.errors import ShapeError, unknown_name
+from acwm_core.errors import DataError, ShapeError, unknown_name
+from acwm_core.files import training_record
 from acwm_core.model.shapes import Clip
 from acwm_core.plugins import catalog
 from acwm_estimators.curve import evenly, trace
-from acwm_estimators.layout import Curve, layout_of
+from acwm_estimators.fitted import fitted_physics, layout_from_dict
+from acwm_estimators.layout import Curve, Layout, layout_of
 from acwm_estimators.limits import limits_fingerprint, physics_of
 from acwm_estimators.network import Output, StateNetwork
 from acwm_estimators.plugin import WEIGHTS
@@ -27,37 +29,35 @@ BATCH = 16
 """Frames per batch."""
 
 
-class Estimator(StateEstimator):
-    """Reads masks and states frame by frame.
+class NetworkEstimator(StateEstimator):
+    """Reads masks and states frame by frame, with the network of a layout.
 
     Args:
-        card: card of an environment in `acwm_estimators.plugin.WEIGHTS`, with any frame size.
-        weights: a file written by `python -m acwm_estimators.train`; by default the one that ships
-            with the package.
+        card: the environment's card, with any frame size.
+        layout: what is read.
+        physics: what can be measured in it.
+        weights: the network's weights.
 
     Raises:
-        RecipeError: no weights ship for this environment.
         ShapeError: the card lacks instances that are read, so it belongs to other data.
         DataError: the file does not exist or holds other weights.
     """
 
-    def __init__(self, card: EnvironmentCard, *, weights: str | None = None) -> None:
+    def __init__(
+        self, card: EnvironmentCard, layout: Layout, physics: Physics, weights: Path
+    ) -> None:
         super().__init__(card)
-        if card.name not in WEIGHTS:
-            raise unknown_name("estimator", card.name, WEIGHTS)
-        self.layout = layout_of(card.name)
-        self.instances = self.layout.instances
+        self.layout, self.weights, self._physics = layout, weights, physics
+        self.instances = layout.instances
         missing = [name for name in self.instances if name not in card.instances]
         if missing:
             raise ShapeError(f"this data of {card.name} has no masks of {', '.join(missing)}")
-        self.weights = Path(weights) if weights else FOLDER / f"{WEIGHTS[card.name]}.safetensors"
-        self._network = StateNetwork(self.layout)
-        load(self._network, self.weights)
+        self._network = StateNetwork(layout)
+        load(self._network, weights)
         self._network.eval().features.fuse()
         self._network.to(memory_format=torch.channels_last)  # pyright: ignore
         ids = [card.instances.index(name) for name in self.instances]
         self._ids = torch.tensor([0, *ids], dtype=torch.uint8)
-        self._physics = physics_of(card.name)
         height, width = card.frame_size
         self.fields = tuple(sorted(self.estimate(torch.zeros(1, 3, height, width)).states))
 
@@ -66,14 +66,12 @@ class Estimator(StateEstimator):
         return self._physics
 
     def packages(self) -> tuple[str, ...]:
-        """Its own package, that of the environment, which defines the physics, and `acwm_sim`."""
-        environment = catalog().component("environment", self.card.name).physics or ""
-        return (*super().packages(), "acwm_sim", environment.partition(".")[0])
+        """Its own package, and the one that reads."""
+        return tuple(dict.fromkeys([*super().packages(), "acwm_estimators"]))
 
     def provenance(self) -> dict[str, str]:
-        """Hashes of the weights, and of the limits that define violations and contacts."""
-        limits = limits_fingerprint(self.card.name)
-        return {"weights": fingerprint(self.weights), "limits": limits}
+        """The hash of the weights."""
+        return {"weights": fingerprint(self.weights)}
 
     def estimate(self, video: Clip) -> Observation:
         if tuple(video.shape[1:]) != (3, *self.card.frame_size):
@@ -132,3 +130,54 @@ class Estimator(StateEstimator):
         seen = (path / [width, height] - 0.5) * [aspect, 1.0]
         line = self.layout.camera.on_plane(seen, curve.plane)[:, :2]
         return evenly(line, nodes, curve.end)
+
+
+class Estimator(NetworkEstimator):
+    """Reads an environment whose weights ship.
+
+    Args:
+        card: card of an environment in `acwm_estimators.plugin.WEIGHTS`, with any frame size.
+        weights: a file written by `python -m acwm_estimators.train`; by default the one that ships
+            with the package.
+
+    Raises:
+        RecipeError: no weights ship for this environment.
+        ShapeError, DataError: as for `NetworkEstimator`.
+    """
+
+    def __init__(self, card: EnvironmentCard, *, weights: str | None = None) -> None:
+        name = card.name
+        if name not in WEIGHTS:
+            raise unknown_name("estimator", name, WEIGHTS)
+        file = Path(weights) if weights else FOLDER / f"{WEIGHTS[name]}.safetensors"
+        super().__init__(card, layout_of(name), physics_of(name), file)
+
+    def packages(self) -> tuple[str, ...]:
+        """Its own package, that of the environment, which defines the physics, and `acwm_sim`."""
+        environment = catalog().component("environment", self.card.name).physics or ""
+        return (*super().packages(), "acwm_sim", environment.partition(".")[0])
+
+    def provenance(self) -> dict[str, str]:
+        """Hashes of the weights, and of the limits that define violations and contacts."""
+        return {**super().provenance(), "limits": limits_fingerprint(self.card.name)}
+
+
+class FittedEstimator(NetworkEstimator):
+    """Reads one's own world, with weights that `acwm train-estimator` wrote.
+
+    Args:
+        card: the card of the environment or of the recordings.
+        weights: the file, which says what is read.
+
+    Raises:
+        ShapeError, DataError: as for `NetworkEstimator`.
+    """
+
+    def __init__(self, card: EnvironmentCard, *, weights: str | Path) -> None:
+        record = training_record(Path(weights))
+        if "layout" not in record:
+            raise DataError(
+                f"{weights} does not say what it reads: it is of `acwm_estimators.train`"
+            )
+        layout = layout_from_dict(record["layout"])
+        super().__init__(card, layout, fitted_physics(layout), Path(weights))

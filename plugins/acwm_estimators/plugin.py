@@ -31,3 +31,13 @@ def register_estimators(registry: Registry) -> None:
             "acwm_estimators.estimator:Estimator",
             summary="masks and states from frames, by a small network with shipped weights",
         )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add the command that trains an estimator of one's own world."""
+    registry.add(
+        "train-estimator",
+        "acwm_estimators.commands:train_estimator",
+        summary="train a network that reads the states of your own world",
+    )

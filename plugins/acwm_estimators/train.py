@@ -25,7 +25,7 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_estimators.frames import Frames, draw, load_frames, reconstructed
-from acwm_estimators.layout import layout_of
+from acwm_estimators.layout import Layout, layout_of
 from acwm_estimators.losses import losses
 from acwm_estimators.network import StateNetwork
 from acwm_estimators.plugin import WEIGHTS
@@ -37,14 +37,16 @@ CODEC = "compact"  # its reconstructions are used for training, too
 RECONSTRUCTED = {True: (8, 13), False: (2, 5)}  # clips and frames per clip, if frames are small
 
 
-def all_frames(folders: Sequence[Path], name: str, most: int) -> list[Frames]:
+def all_frames(folders: Sequence[Path], layout: Layout, most: int) -> list[Frames]:
     """The frames of every dataset, and codec reconstructions of some of them."""
     codec = catalog().create("codec", CODEC).eval()
     found: list[Frames] = []
     for folder in folders:
-        frames = load_frames(folder, layout_of(name), most)
+        frames = load_frames(folder, layout, most)
         clips, length = RECONSTRUCTED[frames.video.shape[1] <= SMALL]
-        found += [frames, reconstructed(frames, codec, clips, length)]
+        sides = frames.video.shape[1:3]
+        can_encode = not any(side % codec.spatial_stride for side in sides)
+        found += [frames, reconstructed(frames, codec, clips, length) if can_encode else frames]
     return found
 
 
@@ -151,7 +153,7 @@ def main(
     network = StateNetwork(layout_of(name))
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     began = time.monotonic()
-    sources = all_frames(data, name, episodes)
+    sources = all_frames(data, layout_of(name), episodes)
     network.calibrate(
         {
             key: np.concatenate([source.targets[key] for source in sources])

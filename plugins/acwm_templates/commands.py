@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from acwm_core.cli.arguments import OUT_FOLDER
+from acwm_core.cli.arguments import FOLDER, OUT_FOLDER
 from acwm_templates.kinds import KINDS
 
 
@@ -17,7 +17,8 @@ from acwm_templates.kinds import KINDS
 @click.option(
     "--environment", default="push_cube", help="Of a task: the environment that it is for."
 )
-def new(kind: str, name: str, out: Path | None, environment: str) -> None:
+@click.option("--weights", type=FOLDER, help="Of an estimator: a file of `acwm train-estimator`.")
+def new(kind: str, name: str, out: Path | None, environment: str, weights: Path | None) -> None:
     """Start a plugin of your own.
 
     Writes a working package with a component called NAME (in snake_case) and tests; change it
@@ -31,11 +32,12 @@ def new(kind: str, name: str, out: Path | None, environment: str) -> None:
       conditioner   brings actions into a model
       objective     how a model learns, and how it predicts
       metric        scores predicted video
+      estimator     reads states from frames; NAME is that of the world
       task          a goal in an environment, with a distance and success
       planner       chooses actions
     """
-    from acwm_templates.package import write_package
+    from acwm_templates.package import package_of, write_package
 
-    folder = write_package(kind, name, out or Path(f"acwm_{name}"), environment)
+    folder = write_package(kind, name, out or Path(package_of(kind, name)), environment, weights)
     checked = f"{environment}.{name}" if kind == "task" else name
     click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {checked}")

@@ -48,6 +48,11 @@ KINDS = {
         "mean absolute error of pixels",
         "acwm evaluate RUN 'evaluation.metrics=[NAME]'",
     ),
+    "estimator": Kind(
+        "estimator",
+        "masks and a position, by the colour of a body",
+        "acwm evaluate RUN --overwrite",
+    ),
     "task": Kind("task", "bring the world to where it once was", "acwm plan RUN NAME"),
     "planner": Kind("planner", "the best of random candidates", "acwm plan RUN TASK planner=NAME"),
 }

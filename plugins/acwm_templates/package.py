@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import keyword
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,14 @@ from acwm_templates.kinds import KINDS
 FILES = Path(__file__).parent / "files"
 
 
-def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
+def package_of(kind: str, name: str) -> str:
+    """The name of the package; an estimator is called like its world, which has a package."""
+    return f"acwm_{name}_estimator" if kind == "estimator" else f"acwm_{name}"
+
+
+def write_package(
+    kind: str, name: str, folder: Path, environment: str, weights: Path | None = None
+) -> Path:
     """Write the package of a component. Either all files appear or none.
 
     Args:
@@ -26,6 +34,7 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
         name: name of the component, in snake_case.
         folder: folder to create.
         environment: for a task, the environment that it is for.
+        weights: for an estimator, those that `acwm train-estimator` wrote.
 
     Raises:
         RecipeError: the name is invalid or taken, or the folder exists.
@@ -37,8 +46,12 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
     whole = f"{environment}.{name}" if kind == "task" else name
     if whole in catalog().registry(registers):
         raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
-    if importlib.util.find_spec(f"acwm_{name}") is not None:
-        raise RecipeError(f"a package acwm_{name} is installed already; choose another name")
+    package = package_of(kind, name)
+    if importlib.util.find_spec(package) is not None:
+        raise RecipeError(f"a package {package} is installed already; choose another name")
+    if weights and (kind != "estimator" or not weights.is_file()):
+        what = "there is no such file" if kind == "estimator" else f"a {kind} has none"
+        raise RecipeError(f"--weights {weights}: {what}")
     if folder.exists():
         raise RecipeError(f"{folder} exists already; choose another --out")
     about: dict[str, Any] = {
@@ -46,6 +59,7 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
         "registers": registers,
         "registered": whole,
         "name": name,
+        "package": package,
         "Name": "".join(word.capitalize() for word in name.split("_")),
         "title": name.replace("_", " "),
         "summary": KINDS[kind].summary,
@@ -53,12 +67,15 @@ def write_package(kind: str, name: str, folder: Path, environment: str) -> Path:
     }
     if kind == "task":
         about |= _field_of(environment)
-    written = {path: text for each in ("package", kind) for path, text in _rendered(each, about)}
+    own = "estimator_of_weights" if weights else kind
+    written = {path: text for each in ("package", own) for path, text in _rendered(each, about)}
     with made_whole(folder) as made:
         for path, text in written.items():
             target = made / path
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(text, encoding="utf-8")
+        if weights:
+            shutil.copyfile(weights, made / package / f"{name}.safetensors")
     return folder
 
 
@@ -81,7 +98,7 @@ def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
             )
         place = template.removesuffix(".j2").replace("NAME", about["name"])
         if place.endswith(".py"):
-            inside = "tests" if place.startswith("test_") else f"acwm_{about['name']}"
+            inside = "tests" if place.startswith("test_") else about["package"]
             place = f"{inside}/{place}"
         found.append((place, text))
     return found

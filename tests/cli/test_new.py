@@ -13,8 +13,12 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_templates.kinds import KINDS
+from acwm_templates.package import package_of
 
-NAMES = {"environment": "open_drawer", "scene": "tidy_shelf", "task": "come_back"}
+NAMES = {
+    **{"environment": "open_drawer", "estimator": "open_drawer"},
+    **{"scene": "tidy_shelf", "task": "come_back"},
+}
 """Names of an author's; those of other kinds are made of the kind."""
 
 
@@ -33,9 +37,10 @@ def packages(tmp_path_factory):
     for kind in KINDS:
         name, folder = name_of(kind), tmp_path_factory.mktemp(kind) / "mine"
         assert run("new", kind, name, "--out", folder).exit_code == 0
-        info = folder / f"acwm_{name}-0.1.dist-info"
+        package = package_of(kind, name)
+        info = folder / f"{package}-0.1.dist-info"
         info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: acwm_{name}\nVersion: 0.1\n")
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.1\n")
         project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
         points = [f"{name} = {value}" for name, value in project["entry-points"]["acwm"].items()]
         (info / "entry_points.txt").write_text("\n".join(["[acwm]", *points]))
@@ -105,7 +110,7 @@ def test_it_is_short_and_the_authors(kind, packages):
     }
     assert sum(len(text.splitlines()) for text in texts.values()) <= 330
     camel = "".join(word.capitalize() for word in name_of(kind).split("_"))
-    module = folder / f"acwm_{name_of(kind)}" / f"{name_of(kind)}.py"
+    module = folder / package_of(kind, name_of(kind)) / f"{name_of(kind)}.py"
     assert f"class {camel}(" in texts[module]
     for path, text in texts.items():
         assert not re.search(r"NAME|{{|template|pendulum", str(path.relative_to(folder)) + text)

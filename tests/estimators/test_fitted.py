@@ -1,0 +1,96 @@
+"""Estimators of one's own world: the fitted camera and layout, and the whole way to one."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from acwm_core.cli import main
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.generate import generate
+from acwm_core.errors import DataError
+from acwm_core.evaluation.clips import as_clip
+from acwm_estimators.estimator import FittedEstimator
+from acwm_estimators.fitted import _camera, fitted_layout, layout_from_dict
+from tests import tiny
+
+
+@pytest.fixture(scope="module")
+def drift(tmp_path_factory):
+    tiny.register()
+    folder = tmp_path_factory.mktemp("data") / "drift"
+    counts = {"train": 24, "ind_test": 4}
+    generate("drift", folder, episodes=counts, workers=0, progress=False)
+    return folder
+
+
+def projected(points, eye, focal):
+    """By a pinhole at `eye` that looks down and a little forward, written out."""
+    tilt = 0.5
+    away = points - np.array(eye)
+    right, forward, up = away.T
+    depth = -up * np.cos(tilt) + forward * np.sin(tilt)
+    down = -(up * np.sin(tilt) + forward * np.cos(tilt))
+    return np.stack([focal * right / depth, focal * down / depth], -1)
+
+
+def test_a_pinhole_camera_is_found_from_points_and_where_they_appear():
+    rng = np.random.default_rng(0)
+    points, other = (rng.uniform([-1, -1, 0], [1, 1, 0.5], (n, 3)) for n in (200, 50))
+    camera = _camera([(points, projected(points, (0, -1, 3), 1.2))])
+    seen = camera.to_frame(other)
+    np.testing.assert_allclose(seen[:, :2], projected(other, (0, -1, 3), 1.2), atol=1e-6)
+    np.testing.assert_allclose(camera.from_frame(seen), other, atol=1e-6)
+    on_table = np.column_stack([other[:, :2], np.full(50, 0.2)])
+    found = camera.on_plane(camera.to_frame(on_table)[:, :2], 0.2)
+    np.testing.assert_allclose(found, on_table, atol=1e-6)
+
+
+def test_a_coordinate_that_never_changes_is_kept():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.full(200, 0.3)])
+    camera = _camera([(points, projected(points, (0, -1, 3), 1.2))])
+    np.testing.assert_allclose(camera.from_frame(camera.to_frame(points)), points, atol=1e-6)
+
+
+def test_each_position_finds_the_mask_that_shows_it(drift):
+    layout = fitted_layout(EpisodeDataset(drift, "train"))
+    ((points,), names) = layout.points, layout.instances
+    assert (points.field, points.instances, names) == ("position", ("square",), ("square",))
+    corner = np.array([[5.0, 20.0, 0.0]])  # row and column of the square's corner, in pixels
+    middle = layout.camera.to_frame(corner)[0, :2] * 32 + 16
+    np.testing.assert_allclose(middle, (20 + 4, 5 + 4), atol=0.6)  # positions are rounded
+    assert layout_from_dict(json.loads(json.dumps(asdict(layout)))) == layout
+
+
+def test_data_without_masks_or_positions_is_refused(drift, tmp_path):
+    generate("tiny_world", tmp_path / "few", episodes={"train": 1}, workers=0, progress=False)
+    with pytest.raises(DataError, match=r"no position in the states .* follows a mask"):
+        fitted_layout(EpisodeDataset(tmp_path / "few", "train"), most=1)
+    with pytest.raises(DataError, match="there is no state 'yaw', but position"):
+        fitted_layout(EpisodeDataset(drift, "train"), {"yaw": 4})
+
+
+@pytest.mark.ci
+def test_one_command_trains_what_reads_the_world(drift, tmp_path):
+    out = tmp_path / "drift.safetensors"
+    done = CliRunner().invoke(
+        main, ["train-estimator", str(drift), "--out", str(out), "--steps", "150"]
+    )
+    assert done.exit_code == 0, done.output
+    assert "position: square" in done.output
+    assert "masks of square: IoU" in done.output
+    dataset = EpisodeDataset(drift, "ind_test")
+    estimator = FittedEstimator(dataset.card.environment, weights=out)
+    true = np.concatenate([dataset[index].states["position"] for index in range(4)])
+    videos = [dataset[index].video for index in range(4)]
+    seen = np.concatenate([estimator.read(as_clip(each)).states["position"] for each in videos])
+    assert np.nanmedian(np.linalg.norm(seen - true, axis=1)) < 1.5  # pixels, of 24
+    made = CliRunner().invoke(
+        main, ["new", "estimator", "drift", "--weights", str(out), "--out", str(tmp_path / "mine")]
+    )
+    assert made.exit_code == 0, made.output
+    weights = tmp_path / "mine" / "acwm_drift_estimator" / "drift.safetensors"
+    assert weights.read_bytes() == out.read_bytes()
