@@ -12,8 +12,8 @@ import re
 import secrets
 import socket
 
-from acwm_core.data.remote import cache_folder
 from acwm_core.errors import RecipeError
+from acwm_core.files import cache_folder
 
 HOST = "127.0.0.1"
 

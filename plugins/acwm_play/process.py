@@ -113,6 +113,13 @@ class SimulatorProcess:
 
     def _ended_error(self) -> PluginError:
         self.alive = False
+        if not hasattr(self, "card"):  # another scene would end alike
+            self._process.join(PATIENCE)
+            code = self._process.exitcode
+            return PluginError(
+                f"the simulator of {self._name} does not start (exit code {code}): `acwm doctor` "
+                "tries it and shows what it prints"
+            )
         return PluginError(f"the simulator of {self._name} has ended: start a new scene")
 
     def _end(self) -> None:

@@ -47,6 +47,13 @@ POLICY = (
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
+THROUGH_SSH = (
+    "this page answers on localhost only, not behind a proxy; to open it on another machine, run "
+    "`ssh -L PORT:localhost:PORT THIS_MACHINE` there, with the port that `acwm play` printed, and "
+    "open the address that it printed\n"
+)
+
+
 class Server:
     """The routes of one server.
 
@@ -73,9 +80,9 @@ class Server:
         """Refuse wrong tokens, and wrong host names (which prevents DNS rebinding)."""
         host = request.host.rpartition(":")[0] or request.host
         given = request.match_info.get("token", "")
-        if host not in (HOST, "localhost") or not hmac.compare_digest(
-            given.encode(), self.secret.encode()
-        ):
+        if host not in (HOST, "localhost"):
+            raise web.HTTPForbidden(text=THROUGH_SSH)
+        if not hmac.compare_digest(given.encode(), self.secret.encode()):
             raise web.HTTPForbidden(text="open the address that `acwm play` printed\n")
         response = await handler(request)
         if not response.prepared:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from acwm_core.errors import AcwmError, AcwmWarning
+from acwm_core.files import cache_folder
 from acwm_sim.shell import undisturbed
 
 CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
@@ -24,8 +25,19 @@ CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
 
 _VARIABLES = ("TI_", "ENABLE_TAICHI")  # they change results, and where and how fast it computes
 
+
+def _home() -> dict[str, str]:
+    """A home for Taichi, which aborts the process without one."""
+    if "HOME" in os.environ:
+        return {}
+    try:
+        return {"HOME": str(Path.home())}
+    except RuntimeError:  # a user without an account, as in some containers
+        return {"HOME": str(cache_folder())}
+
+
 try:
-    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0"):
+    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0", **_home()):
         import taichi as ti
         from taichi.lang import impl, kernel_impl
         from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
@@ -84,8 +96,9 @@ def start() -> None:
         return
     if _started_in is not None:
         raise AcwmError(
-            "Taichi was started before this process was forked and cannot be used here: "
-            "start workers with multiprocessing's 'spawn' method"
+            "a simulator was used before this process was forked and cannot be used here: start "
+            "workers with multiprocessing's 'forkserver' or 'spawn', as in gymnasium.make_vec(…, "
+            "vectorization_mode='async', vector_kwargs={'context': 'forkserver'})"
         )
     if threading.current_thread() is not threading.main_thread():
         raise AcwmError(
@@ -164,20 +177,27 @@ def _initialise() -> None:
 
 
 def _cache() -> Path:
-    """The folder of compiled kernels; a temporary one, with a warning, if it cannot be written."""
-    folder = Path(os.environ.get(CACHE) or impl.default_cfg().offline_cache_file_path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        warnings.warn(
-            f"compiled kernels cannot be kept in {folder} ({error.strerror}), so every command "
-            f"compiles its own, in 10 to 20 seconds: set {CACHE} to another folder",
-            AcwmWarning,
-            stacklevel=2,
-        )
-        temporary = tempfile.TemporaryDirectory(prefix="acwm-")
-        Finalize(None, temporary.cleanup, exitpriority=-1)  # after Taichi has written there
-        os.environ[CACHE] = temporary.name  # also of child processes
-        return Path(temporary.name)
+    """The folder of compiled kernels; a temporary one, with a warning, if none can be written."""
+    folders = [Path(os.environ.get(CACHE, ""))]
+    if CACHE not in os.environ:
+        with undisturbed(*_VARIABLES, **_home()):
+            usual = impl.default_cfg().offline_cache_file_path
+        folders = [Path(usual), cache_folder() / "taichi"]
+    why = ""
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError as error:
+            why = f"{folder} ({error.strerror})"
+    warnings.warn(
+        f"compiled kernels cannot be kept in {why}, so every command compiles its own, in 10 to 20 "
+        f"seconds: set {CACHE} to another folder",
+        AcwmWarning,
+        stacklevel=2,
+    )
+    temporary = tempfile.TemporaryDirectory(prefix="acwm-")
+    Finalize(None, temporary.cleanup, exitpriority=-1)  # after Taichi has written there
+    os.environ[CACHE] = temporary.name  # also of child processes
+    return Path(temporary.name)

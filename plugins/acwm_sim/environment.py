@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, Literal, TypeVar
@@ -92,7 +93,6 @@ class SceneEnvironment(Environment, Generic[Simulation]):
     Attributes:
         drawn_by: the class that draws the simulations.
         limits: lowest and highest values of factors that the simulation accepts.
-        drawing: the instance of `drawn_by` of this environment.
     """
 
     drawn_by: ClassVar[type[Drawing[Any]]]
@@ -105,12 +105,17 @@ class SceneEnvironment(Environment, Generic[Simulation]):
         render_mode: Literal["rgb_array"] | None = "rgb_array",
     ) -> None:
         super().__init__(size=size, render_mode=render_mode)
-        self.drawing: Drawing[Simulation] = self.drawn_by(self.frame_size)
         self._simulation: Simulation | None = None
 
     @abstractmethod
     def _begin(self, factors: Factors, rng: np.random.Generator) -> Simulation:
         """Build the simulation of an episode; all randomness must come from `rng`."""
+
+    @functools.cached_property
+    def drawing(self) -> Drawing[Simulation]:
+        """Draws the simulations. It is made when it is first used: a process that only asks for
+        spaces, such as the parent of Gymnasium's `AsyncVectorEnv`, may fork afterwards."""
+        return self.drawn_by(self.frame_size)
 
     @property
     def simulation(self) -> Simulation:

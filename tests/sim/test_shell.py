@@ -55,7 +55,7 @@ def drawn(folder, worlds=WORLDS, **variables):
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *worlds],
         cwd=folder,
-        env={**os.environ, **variables},
+        env={name: v for name, v in {**os.environ, **variables}.items() if v is not None},
         capture_output=True,
         text=True,
         timeout=900,
@@ -85,8 +85,19 @@ def test_a_home_that_nothing_can_be_written_to(usual, tmp_path):
     home.touch()
     (temporary := tmp_path / "temporary").mkdir()
     folders = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(temporary)}
-    digests, said = drawn(tmp_path, ["reacher"], **folders)
+    assert drawn(tmp_path, ["reacher"], **folders) == ({"reacher": usual["reacher"]}, "")
+    assert [*temporary.glob("acwm-*/taichi/*")]  # compiled kernels are kept there
+    folders["TI_OFFLINE_CACHE_FILE_PATH"] = str(home / "kernels")
+    (other := tmp_path / "other").mkdir()
+    digests, said = drawn(tmp_path, ["reacher"], **{**folders, "TMPDIR": str(other)})
     assert digests["reacher"] == usual["reacher"]
     assert "set TI_OFFLINE_CACHE_FILE_PATH to another folder" in said
     assert "Traceback" not in said
-    assert not [*temporary.iterdir()]
+    assert not [*other.glob("acwm-*/*")]
+
+
+def test_no_home_at_all(usual, tmp_path):
+    """As in a container whose user has no account."""
+    folders = {"HOME": None, "XDG_CACHE_HOME": None, "TMPDIR": str(tmp_path)}
+    digests, said = drawn(tmp_path, ["reacher"], **folders)
+    assert (digests["reacher"], said) == (usual["reacher"], "")

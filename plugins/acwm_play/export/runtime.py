@@ -8,9 +8,8 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-from acwm_core.data.remote import cache_folder
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.files import made_whole, writing
+from acwm_core.files import cache_folder, made_whole, writing
 
 PACKAGE, VERSION = "onnxruntime-web", "1.30.0"
 
