@@ -23,6 +23,24 @@ from acwm_core.env.episode import EpisodeSpec, FactorValue, draw_factors, ood_la
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
 
+
+def checked_seed(seed: object) -> int | None:
+    """The seed of one environment as a Python integer; NumPy's integers are taken, too.
+
+    Raises:
+        ShapeError: it is no whole number of 0 or more.
+    """
+    if seed is None:
+        return None
+    try:
+        whole = operator.index(cast(Any, seed))
+    except TypeError:
+        whole = -1
+    if whole < 0:
+        raise ShapeError(f"a seed is a whole number of 0 or more, not {seed!r:.60}")
+    return whole
+
+
 Policy = Callable[[], NDArray[np.floating[Any]]]
 """A behaviour policy: each call reads the simulator and returns the next raw action, `[A]`."""
 
@@ -142,8 +160,9 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         Raises:
             RecipeError: unknown split or factor, an impossible factor value, no perturbed or no
                 transformed start.
+            ShapeError: the seed is no whole number of 0 or more.
         """
-        super().reset(seed=seed)
+        super().reset(seed=checked_seed(seed))
         options = options or {}
         spec = cast(EpisodeSpec | None, options.get("spec"))
         if spec is None:

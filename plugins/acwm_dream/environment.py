@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.env.environment import checked_seed
 from acwm_core.errors import AcwmError, RecipeError
 from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
@@ -53,7 +53,7 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Frames, dict[str, Any]]:
         """Start an episode."""
-        super().reset(seed=None if seed is None else operator.index(seed))
+        super().reset(seed=checked_seed(seed))
         start = self._dreams.start(self.np_random, options or {})
         result = self._dreams.restart([0], [start], [int(self.np_random.integers(2**31))])
         self._steps, self._frame = 0, result.frames[0]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -12,6 +11,7 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from acwm_core.env.environment import checked_seed
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
 from acwm_dream.dreams import Dreams, Frames, StepResult, settings_of, spaces_of
 
@@ -51,24 +51,24 @@ class DreamVector(gymnasium.vector.VectorEnv[Frames, NDArray[np.float32], NDArra
     def reset(
         self,
         *,
-        seed: int | list[int | None] | None = None,
+        seed: int | Sequence[int | None] | NDArray[np.integer[Any]] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Frames, dict[str, Any]]:
         """Start all episodes. With a single seed, episode k uses that seed + k.
 
         Options are those of `Dream.reset`, and apply to all episodes.
         """
-        if seed is None:
-            seeds: Sequence[int | None] = [None] * self.num_envs
-        elif isinstance(seed, Sequence):
-            seeds = seed
+        if isinstance(seed, Sequence) or np.ndim(cast(Any, seed)):
+            seeds = [checked_seed(each) for each in cast(Iterable[Any], seed)]
         else:
-            seeds = [operator.index(seed) + place for place in range(self.num_envs)]
+            first = checked_seed(seed)
+            places = range(self.num_envs)
+            seeds = [None if first is None else first + place for place in places]
         if len(seeds) != self.num_envs:
             raise RecipeError(f"{len(seeds)} seeds for {self.num_envs} environments")
         for place, each in enumerate(seeds):
             if each is not None:
-                self._rngs[place] = np_random(operator.index(each))[0]
+                self._rngs[place] = np_random(each)[0]
         info: dict[str, Any] = {}
         self._over = np.zeros(self.num_envs, np.bool_)
         self._begin(list(range(self.num_envs)), options or {}, info)

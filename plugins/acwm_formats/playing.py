@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
@@ -227,13 +229,24 @@ def _takes(
         yield Take(policy, space, rng, frames)
 
 
+_OPENGL = re.compile(r"opengl|glfw|gladload|\begl|osmesa|DISPLAY env|X11|NoSuchDisplay", re.I)
+"""What errors of OpenGL's libraries name, if there is no display."""
+
+
 def _rendered(stage: Stage) -> Sequence[Any]:
     try:
-        return stage.render()
+        with warnings.catch_warnings():  # GLFW says several times what the error says, too
+            warnings.filterwarnings("ignore", category=Warning, module="glfw")
+            return stage.render()
     except DataError:
         raise
     except Exception as error:  # e.g. OpenGL or a drawing library is missing
         reason = f"{type(error).__name__}: {error}"
+        if _OPENGL.search(reason):
+            raise DataError(
+                "the environment draws by OpenGL, and there is no display: set MUJOCO_GL=egl (with "
+                "a GPU) or MUJOCO_GL=osmesa, or put xvfb-run before the command"
+            ) from error
         raise DataError(f"the environment cannot be rendered ({reason})") from error
 
 

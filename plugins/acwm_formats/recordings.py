@@ -281,8 +281,8 @@ class _Import:
             count = sum(len(places) for _, places in self.parts.values())
             wrong = sum(1 for some in defects.values() if some)
             choice = "; --on-defect skip imports the others" if kept else ""
-            listed = "\n".join(f"  {line}" for line in few(told))
-            raise DataError(f"{wrong} of {count} recordings have defects{choice}\n{listed}")
+            listed = ";\n".join(f"  {line}" for line in few(told))
+            raise DataError(f"{wrong} of {count} recordings have defects{choice}:\n{listed}")
         places = {(each.scan.split, each.scan.index) for each in kept}
         return kept, [
             str(d) for place, some in defects.items() if place not in places for d in some

@@ -96,3 +96,16 @@ def test_what_cannot_be(run):
         many.step(np.zeros((3, 2), np.float32))
     with pytest.raises(AcwmError, match="num_envs=0"):
         dreams(run, 0)
+
+
+def test_seeds_may_be_an_array(run):
+    many, same = dreams(run), dreams(run)
+    frames, _ = many.reset(seed=np.array([5, 6, 7]))
+    assert np.array_equal(frames, same.reset(seed=[5, 6, 7])[0])
+    assert np.array_equal(frames, same.reset(seed=np.int64(5))[0])
+    for wrong in (np.array([5.0, 6.0, 7.0]), [5, -1, 7], "5", 1.5):
+        with pytest.raises(ShapeError, match="a seed is a whole number of 0 or more, not"):
+            many.reset(seed=wrong)
+    alone = gymnasium.make("acwm/dream-v0", run=run, task="place", device="cpu")
+    with pytest.raises(ShapeError, match="a seed is a whole number"):
+        alone.reset(seed=np.array([5, 6, 7]))
