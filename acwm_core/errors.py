@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import traceback
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +138,12 @@ def check_shape(component: object, method: str, made: Any, *shape: int) -> None:
         wanted = f"{[*shape]}".replace("-1", "n")
         owner = f"{type(component).__module__}.{type(component).__qualname__}"
         raise PluginError(f"{owner}.{method} gives {gave}, not the shape {wanted}")
+
+
+def few(phrases: Sequence[str], most: int = 3) -> str:
+    """The first of some phrases, and how many more there are."""
+    left = len(phrases) - most
+    return "; ".join([*phrases[:most], *([f"{left} more"] if left > 0 else [])])
 
 
 def expect(condition: object, problem: str) -> None:

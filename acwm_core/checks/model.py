@@ -38,6 +38,7 @@ from acwm_core.model.dynamics import Cache, Denoiser, DynamicsModel, Predictor
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.shapes import Latent
+from acwm_core.training.run import check_savable
 
 SHAPE = (2, 4, 4, 8, 8)
 """B, L, C, h, w of the latents used in the checks."""
@@ -127,6 +128,10 @@ class DynamicsChecks(PredictionTrial):
         expect(len({*found}) == len(found), "matrices lists a parameter twice")
         wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
         expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
+
+    def weights_can_be_saved(self) -> None:
+        """Have a state dict of plain tensors, which a run stores as safetensors."""
+        check_savable(self._model.state_dict())
 
     def elements_of_a_batch_are_independent(self) -> None:
         """Predict an element the same way whatever else is in the batch."""

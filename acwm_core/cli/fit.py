@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, Dataset
+from acwm_core.errors import RecipeError, TrainingError, few
 from acwm_core.training.threads import wait_without_spinning
+
+if TYPE_CHECKING:
+    from acwm_core.recipe import Recipe
+
+_OVERRIDE = re.compile(r"\+|[\w.]+=")
+"""What an override begins with."""
 
 
 @click.command()
@@ -17,7 +27,7 @@ from acwm_core.training.threads import wait_without_spinning
     "--out", type=OUT_FOLDER, help="Run folder; runs/RECIPE or runs/RECIPE+small by default."
 )
 def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
-    """Train the world model of RECIPE.
+    """Train the world model of RECIPE, or continue with resume=RUN.
 
     RECIPE is a file or the name of a recipe that comes with acwm. OVERRIDES change it:
 
@@ -27,28 +37,69 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
       data.path=data/mine            any parameter (see `acwm show RECIPE`)
       +small                         the small version: one device, even a CPU
       trainer.devices=8              any flag of Lightning's Trainer
-      resume=runs/mine               continue that run
-      resume=auto                    continue if there is a checkpoint
+      resume=auto                    continue this command's run if it was begun
+
+    `acwm fit resume=RUN` continues a run and takes everything from it, also its length. Overrides
+    may change what does not affect the result, and trainer.max_steps.
 
     The run folder contains the full recipe, checkpoints, logs (tensorboard --logdir runs) and, at
     the end, model.safetensors.
     """
-    from acwm_core.recipe import compose
-
-    resumed = [each for each in overrides if each.startswith("resume=")]
-    others = [each for each in overrides if each not in resumed]
-    composed = compose(recipe, others)
+    words = [recipe, *overrides]
+    resumed = [each for each in words if each.startswith("resume=")]
+    words = [each for each in words if each not in resumed]
     resume = resumed[-1].removeprefix("resume=") if resumed else None
-    if resume not in (None, "auto"):
-        resume = RUN.convert(resume, None, None)
+    if resume in (None, "auto"):
+        composed, run = _recipe_to_start(words, out)
+    else:
+        resume = run = RUN.convert(resume, None, None)
+        composed = _recipe_to_resume(run, words, out)
     path, make = composed.data["path"], "`acwm generate ENVIRONMENT` or `acwm data import`"
     if composed.env:
         make = f"`acwm generate {composed.env.name} --out {path}` (for a small model, --size 64)"
+    if isinstance(resume, Path):
+        make = f"{make}, or name its new place, data.path=…"
     Dataset("dataset", "card.yaml", make).convert(path, None, None)
 
     wait_without_spinning()
     from acwm_core.training.fit import fit as train  # last: importing torch takes seconds
 
-    overlays = "".join(override for override in others if override.startswith("+"))
-    run = train(composed, out or Path("runs", Path(recipe).stem + overlays), resume=resume)
+    run = train(composed, run, resume=resume)
     click.echo(f"trained {run}; next: acwm evaluate {run}")
+
+
+def _recipe_to_start(words: Sequence[str], out: Path | None) -> tuple[Recipe, Path]:
+    """The recipe of a command's words, and the run folder."""
+    from acwm_core.recipe import compose
+
+    if not words:
+        raise RecipeError("resume=auto needs the recipe, too; resume=RUN takes it from the run")
+    name, *overrides = words
+    overlays = "".join(each for each in overrides if each.startswith("+"))
+    return compose(name, overrides), out or Path("runs", Path(name).stem + overlays)
+
+
+def _recipe_to_resume(run: Path, words: Sequence[str], out: Path | None) -> Recipe:
+    """The recipe of a run with overrides.
+
+    Raises:
+        RecipeError: a recipe is named and says something else.
+        TrainingError: another folder is named.
+    """
+    from acwm_core.recipe import compose
+    from acwm_core.recipe.recipe import differences
+    from acwm_core.training.run_folder import RunFolder, resume_command
+
+    folder = RunFolder(run)
+    folder.check_resumable()
+    if out is not None and out.resolve() != run.resolve():
+        raise TrainingError(f"resume={run} continues the run where it is: leave out --out {out}")
+    has_name = bool(words) and not _OVERRIDE.match(words[0])
+    overrides = words[1:] if has_name else words
+    kept = compose(folder.recipe, overrides)
+    if has_name and (others := differences(kept, compose(words[0], overrides), only_set=True)):
+        raise RecipeError(
+            f"the recipe {words[0]} is not the one of {run}: {few(others)}; leave it out, "
+            f"`{resume_command(folder)}` continues the run as it was"
+        )
+    return kept

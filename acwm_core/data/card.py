@@ -181,6 +181,16 @@ class DatasetCard:
                 found.append(f"{name} is {before} there, {after} now")
         return found
 
+    def has_data_of(self, other: DatasetCard) -> bool:
+        """Whether both datasets have the same training episodes, wherever these come from."""
+        ours, theirs = self.checksums.get("train"), other.checksums.get("train")
+        if ours and ours == theirs:
+            ours, theirs = (_recipe(each, "environment") for each in (self, other))
+            return ours == theirs
+        # A simulation that is repeated on another machine may differ in its last bits.
+        is_repeated = not (self.source and ours and theirs)
+        return is_repeated and not self.differences(other)
+
 
 def other_dataset(folder: Path, differences: Iterable[str]) -> DataError:
     """The error that the folder to write a dataset to holds one with these `differences`."""
@@ -201,11 +211,15 @@ def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
     return versions
 
 
-def _recipe(card: DatasetCard) -> dict[str, Any]:
-    """All values that determine the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``."""
+def _recipe(card: DatasetCard, begin: str = "") -> dict[str, Any]:
+    """All values that determine the bytes, flat: ``{"seed": 0, "environment.fps": 10, …}``.
+
+    Args:
+        begin: of these, the values whose names begin with it.
+    """
     values = replace(card, environment=card.environment.recorded).to_dict()
     del values["actions"], values["checksums"]
     values["source"].pop("notes", None)
     if not values["shift"]:  # data from before there were shifts is the same data
         del values["shift"]
-    return dict(flat_items(values))
+    return {name: value for name, value in flat_items(values) if name.startswith(begin)}

@@ -23,6 +23,9 @@ from acwm_core.errors import ShapeError, expect
 ActionKind = Literal["absolute", "delta", "velocity", "torque"]
 """What an action commands: a position, a change of position, a speed, or a force or torque."""
 
+SAME_RATE = 0.01
+"""Relative difference of two rates up to which they are one: 29.97 and 30 frames per second."""
+
 
 SCENE = ("camera", "light")
 """What a card says of the scene beside its fields; cards from before there was such have none."""
@@ -240,6 +243,33 @@ def plain_rate(fps: float | Fraction | str) -> float:
     if rate <= 0:
         raise ShapeError(f"{fps!r} is no rate: give frames per second, such as 30 or 30000/1001")
     return rate.numerator if rate.denominator == 1 else float(rate)
+
+
+def meaning_differences(
+    ours: EnvironmentCard, theirs: EnvironmentCard
+) -> tuple[list[str], list[str]]:
+    """How time and actions of two cards differ in meaning; bounds may differ.
+
+    Returns:
+        Phrases about each, such as ``["30 frames/s"]`` and ``["10 frames/s"]``; empty if both mean
+        the same.
+    """
+    pairs = list[tuple[str, str]]()
+    a, b = ours.action, theirs.action
+    if abs(ours.fps / theirs.fps - 1) > SAME_RATE:
+        pairs.append((f"{ours.fps:g} frames/s", f"{theirs.fps:g} frames/s"))
+    if a.names != b.names:
+        order = " in this order" if sorted(a.names) == sorted(b.names) else ""
+        pairs.append((f"the actions {', '.join(a.names)}{order}", ", ".join(b.names)))
+    elif a.units != b.units:
+        each = zip(a.names, a.units, b.units, strict=True)
+        found = [
+            (f"{n} in {u or 'no unit'}", f"{n} in {v or 'no unit'}") for n, u, v in each if u != v
+        ]
+        pairs.append((", ".join(f for f, _ in found), ", ".join(f for _, f in found)))
+    if a.kind != b.kind:
+        pairs.append((f"actions of the kind {a.kind}", f"the kind {b.kind}"))
+    return [each for each, _ in pairs], [each for _, each in pairs]
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:

@@ -19,6 +19,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.pictures import magnification
 from acwm_core.data.remote import data_folder
 from acwm_core.data.video import write_mp4
+from acwm_core.env.card import meaning_differences
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmWarning, DataError, RecipeError
@@ -43,6 +44,7 @@ from acwm_core.evaluation.summarise import gap, summarise_split
 from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip
 from acwm_core.evaluation.views import metrics_of_views
 from acwm_core.files import held, writing, written_whole
+from acwm_core.model.shapes import float32_by_default
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, run_to_write
@@ -65,6 +67,7 @@ class Entrant:
     secret: bool = False
 
 
+@float32_by_default()
 def evaluate_run(
     run: str | Path,
     *,
@@ -112,6 +115,7 @@ def evaluate_run(
     return evaluate_clips(evaluator, datasets, home, entrant, studies=studies, **how)
 
 
+@float32_by_default()
 def evaluate_clips(
     evaluator: Evaluator,
     datasets: Mapping[str, EpisodeDataset],
@@ -252,7 +256,9 @@ def dataset_of(run: RunFolder, recipe: Recipe) -> str:
 
 
 def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
-    """Check that a dataset has the actions and views that a model was trained on.
+    """Check that a dataset has the rate, the actions and the views that a model was trained on.
+
+    The bounds of recorded actions are those of the recordings, so they may differ.
 
     Raises:
         DataError: it has others.
@@ -263,12 +269,38 @@ def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
             f"{dataset.path} shows the views {', '.join(found.views)}, but the run was trained on "
             f"{', '.join(card.views)}: import it with the same --camera, in the same order"
         )
-    if found.action != card.action:
+    ours, theirs = meaning_differences(found, card)
+    if not ours and not dataset.card.source and found.action != card.action:
+        ours, theirs = ["other bounds of the actions"], ["its own"]
+    if ours:
+        rate = "resample it (--fps), or " if "frames/s" in ours[0] and dataset.card.source else ""
         raise DataError(
-            f"{dataset.path} holds {found.name} with the actions {', '.join(found.action.names)}, "
-            f"but the run was trained on {card.name} with {', '.join(card.action.names)}, or on "
-            "other units or bounds: give data of the same environment"
+            f"{dataset.path} holds {found.name} with {', '.join(ours)}, but the run was trained on "
+            f"{card.name} with {', '.join(theirs)}: {rate}give data of the same environment"
         )
+    _report_range(dataset, card)
+
+
+def _report_range(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
+    """Warn of actions beyond those that the model was trained on."""
+    spec, of_split = card.action, dataset.card.actions.get(dataset.split, {})
+    for name, low, high, least, most in zip(
+        spec.names,
+        spec.low,
+        spec.high,
+        of_split.get("min", ()),
+        of_split.get("max", ()),
+        strict=False,
+    ):
+        slack = 1e-3 * (high - low)
+        if least < low - slack or most > high + slack:
+            warnings.warn(
+                f"{dataset.split} of {dataset.path} has the action {name} from {least:.3g} to "
+                f"{most:.3g}, the model was trained on {low:.3g} to {high:.3g}: beyond, it "
+                "extrapolates",
+                AcwmWarning,
+                stacklevel=2,
+            )
 
 
 def choose_device(name: str, option: str = "evaluation.device=") -> torch.device:

@@ -13,6 +13,7 @@ from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel
 from acwm_core.model.objectives.objective import Objective
+from acwm_core.model.shapes import float32_by_default
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, Recipe
@@ -30,6 +31,7 @@ class CardOfData(Protocol):
         ...
 
 
+@float32_by_default()
 def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> WorldModel:
     """Build codec, model, conditioner and objective of a recipe, with freshly initialised weights.
 
@@ -71,6 +73,7 @@ def state_shapes(names: Sequence[str], card: EnvironmentCard) -> dict[str, tuple
     return {name: tuple(shapes[name]) for name in names}
 
 
+@float32_by_default()
 def build_codec(choice: ComponentConfig) -> Codec:
     """Build the codec that a recipe names."""
     codec = build_component("codec", choice, Codec)

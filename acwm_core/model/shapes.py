@@ -8,9 +8,11 @@ to frame i + 1, so T frames have T rows and the last row is zero. ``sigma`` is t
 latent frame: 0 is clean, 1 is noise.
 """
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Generator, Mapping
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -71,3 +73,14 @@ def check_pixels(video: Video) -> None:
             f"frames must be in [0, 1], not in [{low:g}, {high:g}]: divide 8-bit values by 255, "
             "and clamp after resizing"
         )
+
+
+@contextlib.contextmanager
+def float32_by_default() -> Generator[None]:
+    """Create tensors in float32, whatever the script has chosen by `torch.set_default_dtype`."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)

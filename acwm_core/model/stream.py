@@ -9,7 +9,7 @@ import torch
 
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.shapes import Actions, Latent, Video
+from acwm_core.model.shapes import Actions, Latent, Video, float32_by_default
 
 if TYPE_CHECKING:
     from acwm_core.model.world_model import WorldModel
@@ -74,6 +74,7 @@ class Stream:
             )
 
     @torch.no_grad()
+    @float32_by_default()
     def step(self, actions: Actions) -> Video:
         """Predict the frames that the actions of one latent step lead to.
 

@@ -14,7 +14,7 @@ from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
 from acwm_core.model.dynamics import DynamicsModel, Predictor, hidden_matrices
 from acwm_core.model.objectives.objective import Batch, Objective
-from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels
+from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels, float32_by_default
 from acwm_core.model.stream import Stream, continued
 
 CLIP_FRAMES = 37
@@ -178,6 +178,7 @@ class WorldModel(nn.Module):
             states = states[:, :: self.codec.temporal_stride]
         return states if self.model.raw_states else (states - self.state_mean) / self.state_std
 
+    @float32_by_default()
     def rollout(
         self,
         given: Frame | Video,
@@ -267,6 +268,7 @@ class WorldModel(nn.Module):
             video = chunk[:, -known:]
             yield chunk if start == 0 else chunk[:, known:]
 
+    @float32_by_default()
     def stream(
         self,
         given: Frame | Video,
@@ -311,7 +313,7 @@ class WorldModel(nn.Module):
                 f"a model is given frames [B, 3, H, W] or [B, K, 3, H, W], K = 1 + n·"
                 f"{stride}, not {list(given.shape)}"
             )
-        return video
+        return self._as_own(video)
 
     @torch.no_grad()
     def predict_latents(
@@ -373,6 +375,11 @@ class WorldModel(nn.Module):
             )
         return actions
 
+    def _as_own(self, values: Tensor) -> Tensor:
+        """Double precision, which NumPy gives, in the model's own."""
+        is_double = values.dtype == torch.float64 != self.action_low.dtype
+        return values.float() if is_double else values
+
     def normalise(self, actions: Actions) -> Actions:
         """Scale raw actions `[B, T, A]` to [-1, 1] by their bounds."""
         if actions.shape[2] != len(self.action_low):
@@ -380,7 +387,8 @@ class WorldModel(nn.Module):
                 f"the model was built for {len(self.action_low)} action dimensions, "
                 f"not {actions.shape[2]}"
             )
-        return 2 * (actions - self.action_low) / (self.action_high - self.action_low) - 1
+        rows = self._as_own(actions)
+        return 2 * (rows - self.action_low) / (self.action_high - self.action_low) - 1
 
     def _prepare(self, actions: Actions, latent_frames: int) -> Actions:
         """Normalise, fill up the last latent frame, and zero the last row, which leads to no frame.

@@ -38,6 +38,9 @@ FREE_TO_CHANGE = (
 The devices may change if an optimiser step takes as many clips as before, which `ClipData` checks.
 """
 
+LONGEST_SHOWN = 60
+"""Characters of a value that messages show."""
+
 
 @dataclass(frozen=True)
 class ComponentConfig:
@@ -134,12 +137,26 @@ def compose(
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
     """What a resumed run would change, as phrases such as ``"model.layers was 4, is 6"``."""
+    return [each for each in differences(before, now) if not each.startswith(FREE_TO_CHANGE)]
+
+
+def differences(before: Recipe, now: Recipe, *, only_set: bool = False) -> list[str]:
+    """The parameters that differ, as phrases such as ``"model.layers was 4, is 6"``.
+
+    Args:
+        only_set: leave out parameters that `now` does not set.
+    """
     old, new = dict(flat_items(before.to_dict())), dict(flat_items(now.to_dict()))
     return [
-        f"{name} was {old.get(name, 'not set')}, is {new.get(name, 'not set')}"
+        f"{name} was {_shown(old.get(name))}, is {_shown(new.get(name))}"
         for name in sorted({*old, *new})
-        if old.get(name) != new.get(name) and not name.startswith(FREE_TO_CHANGE)
+        if old.get(name) != new.get(name) and not (only_set and new.get(name) is None)
     ]
+
+
+def _shown(value: Any) -> str:
+    text = "not set" if value is None else str(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}…"
 
 
 def flat_items(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

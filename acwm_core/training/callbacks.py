@@ -17,10 +17,11 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from acwm_core.errors import TrainingError
 from acwm_core.files import written_whole
+from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.module import TrainingModule
 from acwm_core.training.optimizers import gradient_norm, total_norm
 from acwm_core.training.pictures import draw_strip, encode_gif, show_gif, show_picture
-from acwm_core.training.run import save_weights
+from acwm_core.training.run import check_savable, save_weights
 from acwm_core.training.run_folder import RunFolder
 
 MAX_ROLLOUT_STEPS = 4
@@ -124,6 +125,11 @@ class SavedWeights(Callback):
     def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._codec: str | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Refuse weights that cannot be saved, before steps are lost."""
+        assert isinstance(pl_module, TrainingModule)
+        check_savable(without_codec(pl_module.state_dict()))
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]

@@ -86,7 +86,8 @@ class TrainingConfig:
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
             default weights are initialised randomly.
         ignore_mismatched_sizes: with `init_from`, take the weights that fit by name and shape, even
-            if they were trained on latents of another codec, and initialise the others randomly.
+            if they were trained on latents of another codec, another rate or other actions, and
+            initialise the others randomly.
         seed: seed of initial weights, clip order and noise.
         compile: compile the model with `torch.compile`; pays off after minutes.
         activation_checkpointing: keep only the inputs of each layer and recompute its activations

@@ -18,9 +18,11 @@ from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import DataConfig
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.loader import WORKER_DIED
+from acwm_core.env.card import EnvironmentCard, meaning_differences
 from acwm_core.env.environment import resolve_size
 from acwm_core.errors import AcwmError, AcwmWarning, RecipeError, TrainingError
 from acwm_core.model.build import build_world_model
+from acwm_core.model.shapes import float32_by_default
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training import callbacks
@@ -40,8 +42,9 @@ from acwm_core.training.resume import (
     is_first_process,
 )
 from acwm_core.training.run import all_training, load_fitting_weights, load_weights
-from acwm_core.training.run_folder import RunFolder, find_run
-from acwm_core.training.signals import Preemption, StoppedEarly, how_to_resume
+from acwm_core.training.run_folder import RunFolder, find_run, resume_command
+from acwm_core.training.schedule import ResumedSchedule
+from acwm_core.training.signals import Preemption, StoppedEarly
 from acwm_core.training.threads import use_threads
 from acwm_core.training.throughput import Throughput
 from acwm_core.training.tracking import begin, tracking
@@ -49,6 +52,7 @@ from acwm_core.training.trainer import build_trainer
 from acwm_core.training.verdict import first_decides
 
 
+@float32_by_default()
 def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None) -> Path:
     """Train the world model of a recipe.
 
@@ -107,29 +111,28 @@ def _train(
     continued: Sequence[Logger],
 ) -> None:
     config = TrainingConfig(**recipe.training)
-    if config.agent_steps and not recipe.data.get("states"):
-        raise RecipeError(
-            f"training.agent_steps={config.agent_steps} learn how the agent's states move: name "
-            "them, data.states=[…], or leave it out"
-        )
+    _check_states(config, recipe)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, episodes.card.environment)
     start = None
     if config.init_from and checkpoint is None:
+        _check_meaning(config, episodes.card.environment)
         start = _start_from(config.init_from, world_model, recipe, config.ignore_mismatched_sizes)
     clips = DataConfig(**recipe.data)
     kind = GrowingClipData if clips.growing else ClipData
     data = kind(clips, episodes, world_model.codec, config.seed)
     module, preemption = TrainingModule(world_model, config), Preemption(run)
+    before = Recipe.from_yaml(run.recipe) if checkpoint else None
+    schedule = ResumedSchedule(before.trainer.get("max_steps", -1) if before else None)
     trainer = build_trainer(
         recipe.trainer,
         config,
-        [preemption, callbacks.CpuTime(start), *_callbacks(run, config, data)],
+        [preemption, callbacks.CpuTime(start), schedule, *_callbacks(run, config, data)],
         loggers,
     )
     on_one_cpu = trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1
-    before = Recipe.from_yaml(run.recipe).training.get("cpu_threads") if checkpoint else None
-    threads = use_threads(config.cpu_threads, before, choose=on_one_cpu and not checkpoint)
+    known = before.training.get("cpu_threads") if before else None
+    threads = use_threads(config.cpu_threads, known, choose=on_one_cpu and not checkpoint)
     recipe = replace(recipe, training={**recipe.training, "cpu_threads": threads})
     with (
         _explained(trainer, run, preemption),
@@ -140,6 +143,50 @@ def _train(
             begin(logger)  # those of the recipe's own classes
             logger.log_hyperparams(recipe.to_dict())
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+        _check_saved(run, trainer)
+
+
+def _check_states(config: TrainingConfig, recipe: Recipe) -> None:
+    if config.agent_steps and not recipe.data.get("states"):
+        raise RecipeError(
+            f"training.agent_steps={config.agent_steps} learn how the agent's states move: name "
+            "them, data.states=[…], or leave it out"
+        )
+
+
+def _check_saved(run: RunFolder, trainer: L.Trainer) -> None:
+    """Refuse to call a model trained that is nowhere."""
+    if trainer.is_global_zero and not run.weights.exists():
+        raise TrainingError(
+            f"nothing was trained, as the flags allowed {trainer.global_step} steps: set "
+            "trainer.max_steps, max_time and limit_train_batches so that there is one"
+        )
+
+
+def _check_meaning(config: TrainingConfig, card: EnvironmentCard) -> None:
+    """Refuse to start from weights of other actions, unless any may be taken; tell other bounds."""
+    name = str(config.init_from)
+    initial = RunFolder(find_run(name))
+    if not initial.card.is_file():
+        return
+    before = DatasetCard.read(initial.card).environment
+    ours, theirs = meaning_differences(card, before)
+    message = ""
+    if ours:
+        message = (
+            f"the data has {', '.join(ours)}, but {name} was trained with {', '.join(theirs)}, so "
+            "its weights mean something else"
+        )
+        if not config.ignore_mismatched_sizes:
+            anyway = "training.ignore_mismatched_sizes=true starts from them all the same"
+            raise TrainingError(f"{message}: {anyway}")
+    elif (card.action.low, card.action.high) != (before.action.low, before.action.high):
+        message = (
+            f"the bounds of the actions are not those of {name}, so what it learnt of their size "
+            "is off by as much at first"
+        )
+    if message and is_first_process():
+        warnings.warn(message, AcwmWarning, stacklevel=2)
 
 
 def _start_from(
@@ -231,7 +278,7 @@ def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Ge
             raise
         raise TrainingError(
             "another process of this training failed, see its message; once that is fixed, "
-            f"{how_to_resume(run)}"
+            f"continue with `{resume_command(run)}`"
         ) from error
 
 

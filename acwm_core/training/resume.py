@@ -12,13 +12,12 @@ import lightning as L
 from lightning.pytorch.utilities import rank_zero_only
 
 from acwm_core.data.card import DatasetCard
-from acwm_core.errors import TrainingError
+from acwm_core.errors import TrainingError, few
 from acwm_core.files import held, written_whole
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training.checkpoints import check_sums, last_whole
 from acwm_core.training.precision import with_recorded_precision
-from acwm_core.training.run import read_metadata
-from acwm_core.training.run_folder import RunFolder
+from acwm_core.training.run_folder import RunFolder, resume_command
 from acwm_core.training.signals import StoppedEarly
 
 AUTO = "auto"
@@ -58,41 +57,42 @@ def checkpoint_to_resume(
     last = last_whole(run.last_checkpoint)
     if not is_first_process():
         return None if resume is None else last
-    if run.weights.exists() and "imported" in read_metadata(run.weights):
-        raise TrainingError(
-            f"{run.path} holds imported weights and no training to resume: start from them by "
-            f"training.init_from={run.path}, and train into another folder"
-        )
+    run.check_resumable()
     if not run.recipe.exists():
         if last or resume not in (None, AUTO):
             raise TrainingError(f"there is nothing to resume: {run.path} holds no run")
         return None
     if resume is None:
-        way = f"continue it by resume={run.path}" if last else "it has no checkpoint: remove it"
-        raise TrainingError(f"{run.path} holds a run already: {way}, or choose another --out")
-    before = Recipe.from_yaml(run.recipe)
-    if last is not None:
-        recipe = with_recorded_precision(recipe, before, last)
-        before = with_recorded_precision(before, before, last)
-    differences = recipe_differences(before, recipe)
-    there = DatasetCard.read(run.card)
-    other_data = [f"dataset {d}" for d in there.differences(card)]
-    scene = [] if other_data else there.environment.contradictions(card.environment)
-    differences += other_data
-    differences += [f"the dataset's card says otherwise of its {name} now" for name in scene]
+        raise TrainingError(
+            f"{run.path} holds a run already: continue it with `{resume_command(run)}`, or choose "
+            "another --out"
+        )
+    differences = _differences(run, recipe, card, last)
     if differences:
         raise TrainingError(
-            f"{run.path} was started with another recipe: {'; '.join(differences)}; resume with "
-            "the old one, or train into a new folder"
+            f"{run.path} was started with another recipe: {few(differences)}; "
+            f"`{resume_command(run)}` continues it as it was, training.init_from={run.path} starts "
+            "another run from its weights"
         )
     if last is not None:
         check_sums(last)
-    elif resume != AUTO:
-        raise TrainingError(
-            f"there is nothing to resume: {run.path} stopped before its first checkpoint; remove "
-            "the folder and train again"
-        )
     return last
+
+
+def _differences(run: RunFolder, recipe: Recipe, card: DatasetCard, last: Path | None) -> list[str]:
+    """What a resumed run would change; the same data may lie in another place."""
+    started = Recipe.from_yaml(run.recipe)
+    if last is not None:
+        recipe = with_recorded_precision(recipe, started, last)
+        started = with_recorded_precision(started, started, last)
+    found = recipe_differences(started, recipe)
+    found = [each for each in found if not each.startswith("data.path ")]
+    before = DatasetCard.read(run.card)
+    if before.has_data_of(card):
+        return found
+    others = [each for each in before.differences(card) if not each.startswith("source.")]
+    why = few(others, 1) if others else "other recordings"
+    return [*found, f"{recipe.data['path']} holds other data ({why})"]
 
 
 @contextlib.contextmanager

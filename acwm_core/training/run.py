@@ -18,7 +18,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
 from acwm_core.files import written_whole
 from acwm_core.model.build import build_world_model
-from acwm_core.model.shapes import check_finite
+from acwm_core.model.shapes import check_finite, float32_by_default
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import COMPONENTS
@@ -39,6 +39,7 @@ class RunBundle(NamedTuple):
     world_model: WorldModel  # with the averaged weights, in evaluation mode, on the CPU
 
 
+@float32_by_default()
 def load_run(path: Path | str) -> RunBundle:
     """Load the model of a run folder, or a trained model by its name or address.
 
@@ -78,10 +79,39 @@ def save_weights(
         step: number of optimiser steps of the weights.
         **details: further JSON-ready facts for the metadata.
     """
-    kept = {k: v.contiguous().cpu() for k, v in weights.items() if k.startswith(TRAINED)}
+    trained = {name: value for name, value in weights.items() if name.startswith(TRAINED)}
+    check_savable(trained)
+    kept, seen = dict[str, Tensor](), set[int]()
+    for name, value in trained.items():
+        whole = value.contiguous().cpu()
+        place = whole.untyped_storage().data_ptr()
+        kept[name] = whole.clone() if place in seen else whole  # tied weights; each is stored
+        seen.add(place)
     facts = {"format": FORMAT, "step": step, "codec": codec, "sha256": digest(kept), **details}
     with written_whole(path) as partial:
         cast(Any, safetensors.torch).save_file(kept, partial, metadata={"acwm": json.dumps(facts)})
+
+
+def check_savable(state: Mapping[str, Any]) -> None:
+    """Check that a state dict can be stored as safetensors, before any training is lost.
+
+    Raises:
+        TrainingError: an entry is no plain tensor; names it.
+    """
+    for name, value in state.items():
+        what = type(value).__name__
+        if isinstance(value, Tensor):
+            if value.layout == torch.strided and not value.is_quantized:
+                try:
+                    cast(Any, safetensors.torch).save({name: torch.empty(0, dtype=value.dtype)})
+                    continue
+                except (KeyError, ValueError, TypeError, safetensors.SafetensorError):
+                    pass
+            what = f"{value.dtype} tensor of layout {value.layout}"
+        raise TrainingError(
+            f"the weights cannot be saved: {name} is a {what}, a state dict holds plain tensors "
+            "(register a tensor as a parameter or a buffer)"
+        )
 
 
 def digest(weights: Mapping[str, Tensor]) -> str:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import filecmp
 import inspect
+import shlex
 import shutil
 from pathlib import Path
 
-from acwm_core.errors import TrainingError
+from acwm_core.errors import RecipeError, TrainingError
 from acwm_core.files import alone, check_inside, made_whole, writing
 from acwm_core.plugins import catalog
+from acwm_core.recipe.compose import read_recipe
+from acwm_core.recipe.trust import refuse_code
 
 COPIES = Path("runs", "trained")
 """Folder for results of trained models, whose own folder may be part of a package."""
@@ -54,6 +57,24 @@ class RunFolder:
     def check_links(self) -> None:
         """Refuse links that lead out of the folder among acwm's own files."""
         check_inside(self.path, *OWN)
+
+    def check_resumable(self) -> None:
+        """Refuse a folder with weights and without checkpoints, as of a trained model."""
+        if self.weights.exists() and not any(self.checkpoints.glob("*last.ckpt*")):
+            raise TrainingError(
+                f"{self.path} holds weights and no checkpoint to resume from: start from them by "
+                f"training.init_from={self.path}, and train into another folder"
+            )
+
+
+def resume_command(run: RunFolder) -> str:
+    """The command that continues a run; all else is in its recipe."""
+    try:
+        refuse_code(read_recipe(run.recipe))
+        trust = ""
+    except RecipeError:  # code that was typed when the run was started
+        trust = " --trust-recipe"
+    return f"acwm fit resume={shlex.quote(str(run.path))}{trust}"
 
 
 def trained_models() -> list[str]:

@@ -23,8 +23,7 @@ from torch import distributed
 from acwm_core.errors import TrainingError
 from acwm_core.interrupts import INTERRUPTED
 from acwm_core.training.callbacks import stepped
-from acwm_core.training.checkpoints import last_whole
-from acwm_core.training.run_folder import RunFolder
+from acwm_core.training.run_folder import RunFolder, resume_command
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 """Ctrl-C, the usual request to end, and what ``#SBATCH --signal=USR1@120`` sends before the time
@@ -154,19 +153,14 @@ class Preemption(Callback):
         """The error for training that ended early; it says how to continue."""
         is_asked = self._received > 1  # a signal other than Ctrl-C
         return StoppedEarly(
-            f"{what}; {how_to_resume(self._run)}", os.EX_TEMPFAIL if is_asked else INTERRUPTED
+            f"{what}; continue with `{resume_command(self._run)}`",
+            os.EX_TEMPFAIL if is_asked else INTERRUPTED,
         )
 
     @property
     def _name(self) -> str:
         number = SIGNALS[self._received - 1]
         return "Ctrl-C" if number == signal.SIGINT else number.name
-
-
-def how_to_resume(run: RunFolder) -> str:
-    """A phrase that says how to continue a run that ended early."""
-    saved = last_whole(run.last_checkpoint)
-    return f"continue with resume={run.path}" if saved else "start again with resume=auto"
 
 
 def _handle(handlers: dict[signal.Signals, Any]) -> None:

@@ -12,7 +12,7 @@ import lightning as L
 import torch
 from jsonargparse import ArgumentError, ArgumentParser
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
+from lightning.pytorch.callbacks import Callback, ProgressBar
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.plugins import CheckpointIO
 from lightning.pytorch.strategies import (
@@ -48,6 +48,7 @@ def build_trainer(
         others = [each for each in chosen_loggers(flags) if not isinstance(each, str)]
         flags = {**flags, "logger": others}
     chosen = instantiate_flags(flags)
+    _check_saves(chosen)
     _check_flags(chosen, config)
     accelerator = chosen.get("accelerator", "auto")
     if "precision" in chosen:
@@ -133,10 +134,33 @@ def _listed(given: Any) -> list[Any]:
 
 def _wanted(callback: Callback, flags: Mapping[str, Any], added: Sequence[Callback]) -> bool:
     """Whether the flags allow one of acwm's callbacks; Lightning refuses contradictions."""
-    if isinstance(callback, ProgressBar):
-        replaced = any(isinstance(other, ProgressBar) for other in added)
-        return flags.get("enable_progress_bar") is not False and not replaced
-    return not isinstance(callback, Checkpoint) or flags.get("enable_checkpointing") is not False
+    if not isinstance(callback, ProgressBar):
+        return True
+    replaced = any(isinstance(other, ProgressBar) for other in added)
+    return flags.get("enable_progress_bar") is not False and not replaced
+
+
+def _check_saves(flags: Mapping[str, Any]) -> None:
+    """Refuse flags with which training would leave nothing, or not what they say."""
+    for wrong, message in (
+        (
+            flags.get("enable_checkpointing") is False or bool(flags.get("barebones")),
+            "training that saves no checkpoint leaves no model: leave out "
+            "trainer.enable_checkpointing and trainer.barebones; "
+            "training.checkpoint_every_n_steps=N saves more rarely",
+        ),
+        (
+            flags.get("max_steps") == 0,
+            "trainer.max_steps=0 trains nothing: set it to 1 or more",
+        ),
+        (
+            bool(flags.get("overfit_batches")),
+            "clips are an endless stream, which trainer.overfit_batches does not hold: train on "
+            "fewer episodes by data.fraction",
+        ),
+    ):
+        if wrong:
+            raise TrainingError(message)
 
 
 def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:

@@ -59,6 +59,15 @@ class NoHeads(Flawed):
         self.heads = 0
 
 
+@FLAWS.caught_by("weights can be saved", "_extra_state is a dict")
+class MoreThanTensors(Flawed):
+    def get_extra_state(self):
+        return {"steps": 0}
+
+    def set_extra_state(self, state):
+        pass
+
+
 @FLAWS.caught_by("can be constructed", "the number of widths is 1, not 2")
 class OneWidthForTwo(Flawed):
     widths = (32,)

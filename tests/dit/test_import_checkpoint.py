@@ -168,7 +168,9 @@ def test_training_does_not_write_over_imported_weights(latest, wan, data, tmp_pa
     made = import_checkpoint(latest(content()), tmp_path / "run", words)
     before = (made.run / "model.safetensors").read_bytes()
     for resume in (None, "auto", made.run):
-        with pytest.raises(TrainingError, match=r"imported weights.*training\.init_from="):
+        with pytest.raises(
+            TrainingError, match=r"holds weights and no checkpoint.*training\.init_from="
+        ):
             fit(made.recipe, made.run, resume=resume)
     assert (made.run / "model.safetensors").read_bytes() == before
 

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -6,10 +7,12 @@ import pytest
 import torch
 from PIL import Image
 
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.pictures import to_pixels
 from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import AcwmWarning, DataError, RecipeError, ShapeError
+from acwm_core.evaluation.evaluate import check_environment
 from acwm_core.training.run import load_run
 from acwm_dream.rollout import _read_actions, frame_strip, rollout_run
 from acwm_formats.arrays import write_dataset
@@ -178,7 +181,7 @@ def test_wrong_requests_are_refused(evaluated, tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
         rollout_run(evaluated, video, actions=rows)
     with pytest.raises(
-        DataError, match="holds other with the actions x, y, but the run was trained"
+        DataError, match="holds other with 5 frames/s, the actions x, y, but the run was trained"
     ):
         rollout_run(evaluated, video, data=of_another_environment(tmp_path / "other"))
     for wrong, error in (
@@ -214,3 +217,36 @@ def test_actions_at_their_bounds_are_accepted(kind, tmp_path):
     np.save(tmp_path / "actions.npy", rows * 1.001)
     with pytest.raises(ShapeError, match="outside their bounds"):
         _read_actions(tmp_path / "actions.npy", spec)
+
+
+SPEC = ActionSpec(("x", "y"), ("m", "m"), (-1, -1), (1, 1), "delta")
+
+
+@pytest.mark.parametrize(
+    ("spec", "fps", "said"),
+    [
+        ({}, 30, "30 frames/s, but .* 10 frames/s: resample it"),
+        ({"kind": "absolute"}, 10, "kind absolute, but .* the kind delta"),
+        ({"names": ("y", "x")}, 10, "the actions y, x in this order, but .* x, y"),
+        ({"units": ("m", "cm")}, 10, "y in cm, but .* y in m"),
+        ({"low": (-3, -1), "high": (1, 4)}, 10.05, None),
+    ],
+)
+def test_data_must_mean_the_same_and_may_have_another_range(spec, fps, said, tmp_path):
+    """New recordings of one robot have bounds of their own; beyond, the model extrapolates."""
+    changed = replace(SPEC, **spec)
+    recordings = {"train": Noise([9]), "ind_test": Noise([9])}
+    for name, action, rate in (("before", SPEC, 10), ("now", changed, fps)):
+        card = {"name": "mine", "action": action, "fps": rate}
+        write_dataset(tmp_path / name, recordings, **card, progress=False)
+    before = DatasetCard.read(tmp_path / "before").environment
+    dataset = EpisodeDataset(tmp_path / "now", "ind_test")
+    if said:
+        with pytest.raises(DataError, match=said):
+            check_environment(dataset, before)
+        return
+    statistics = {"ind_test": {"min": [-2.5, -1], "max": [1, 1]}}
+    dataset.card = replace(dataset.card, actions=statistics)
+    with pytest.warns(AcwmWarning, match=r"action x from -2.5 to 1, .*trained on -1 to 1") as told:
+        check_environment(dataset, before)
+    assert len(told) == 1

@@ -88,7 +88,7 @@ def test_recipes_in_commands_are_valid(document):
         command, *rest = shlex.split(line)[1:] or [""]
         if command not in ("fit", "show") or not rest or rest[0] in ("RECIPE", "…", "--help"):
             continue
-        if rest[0].startswith("runs/"):  # the recipe of a run that the reader has made
+        if rest[0].startswith(("runs/", "resume=")):  # of a run that the reader has made
             continue
         if "$ " + line not in misspelt():
             words = itertools.takewhile(lambda word: not word.startswith("--"), rest[1:])

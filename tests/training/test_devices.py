@@ -139,7 +139,8 @@ def runs(data, tmp_path_factory):
     jobs = [job(made, name, weighed=True) for name in ("ddp", "fsdp")]
     jobs += [job(made, "stopped"), job(made, "stopped", resume=True), job(made, "poisoned")]
     *others, poisoned = outcomes(data, jobs)
-    stopped = f"75: stopped by SIGTERM, saved step 10; continue with resume={made['stopped'].path}"
+    command = f"`acwm fit resume={made['stopped'].path} --trust-recipe`"
+    stopped = f"75: stopped by SIGTERM, saved step 10; continue with {command}"
     assert others == [None, None, stopped, None]
     assert poisoned.startswith("2: the loss or its gradient is not finite in step 5 (")
     return made

@@ -1,5 +1,6 @@
 """Whole runs of `fit` on tiny parts: files, resumption, refusals, and what a user sees."""
 
+import shutil
 import time
 
 import numpy as np
@@ -11,7 +12,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from acwm_core.data.clips import ClipDataset
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.errors import TrainingError
+from acwm_core.errors import AcwmWarning, TrainingError
 from acwm_core.training.callbacks import CpuTime
 from acwm_core.training.fit import fit
 from acwm_core.training.module import VALIDATION_NOISE, generator_of
@@ -162,6 +163,34 @@ def test_a_finished_run_goes_on_with_more_steps(data, tmp_path):
     assert_same(whole, run)
 
 
+def test_a_longer_schedule_is_followed_at_once_and_reported(data, tmp_path):
+    """The rates of all later steps are those of a run that had this length from the start."""
+    growing = {"training": {"growing_horizon": 0.5}}
+    whole = RunFolder(fit(tiny_recipe(data, **growing), tmp_path / "whole"))
+    run = fit(tiny_recipe(data, trainer={"max_steps": 7}, **growing), tmp_path / "run")
+    said = (
+        r"trainer.max_steps was 7, is 16: the learning rate goes from 0 to 0.00562 at step 7, as "
+        r"training.schedule=linear .*; clips are shorter again until step 8"
+    )
+    with pytest.warns(AcwmWarning, match=said):
+        fit(tiny_recipe(data, **growing), "", resume=run)
+    rates = [
+        numbers(each)[f"{s}", "train/learning_rate"]
+        for each in (RunFolder(run), whole)
+        for s in range(7, 16)
+    ]
+    assert rates[:9] == rates[9:]
+
+
+@pytest.mark.parametrize(
+    "flags", [{"limit_train_batches": 0}, {"max_steps": 9, "max_time": "00:00:00:00"}]
+)
+def test_a_run_of_no_step_is_no_success(flags, data, tmp_path):
+    with pytest.raises(TrainingError, match="nothing was trained, as the flags allowed 0 steps"):
+        fit(tiny_recipe(data, trainer=flags), tmp_path / "run")
+    assert not (tmp_path / "run" / "recipe.yaml").exists()
+
+
 def test_max_time_ends_a_run_that_goes_on_exactly(data, tmp_path):
     constant = {"training": {"schedule": "constant"}}
     limit = {"max_steps": -1, "max_time": "00:00:00:01"}
@@ -217,7 +246,9 @@ def test_sample_videos_show_the_truth_beside_the_average(data, tmp_path):
 
 def test_a_taken_folder_and_another_recipe_are_refused(whole, data):
     before = whole.weights.read_bytes()
-    with pytest.raises(TrainingError, match=r"holds a run already.*resume="):
+    with pytest.raises(
+        TrainingError, match=r"holds a run already: continue it with `acwm fit resume="
+    ):
         fit(killable(data), whole.path)
     changed = killable(data, model={"width": 6}, training={"seed": 1})
     with pytest.raises(
@@ -240,12 +271,12 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
         fit(killable(data), "", resume=tmp_path / "nowhere")
     monkeypatch.setattr(Kill, "batch", 1)
     run = killed_run(data, tmp_path / "run", monkeypatch)
-    with pytest.raises(TrainingError, match="stopped before its first checkpoint"):
-        fit(killable(data), "", resume=run.path)
-    with pytest.raises(TrainingError, match="has no checkpoint: remove it"):
-        fit(killable(data), run.path)
     with pytest.raises(TrainingError, match="no trained weights yet"):
         load_run(run.path)
+    fit(killable(data), "", resume=run.path)  # it starts, as nothing was saved
+    shutil.rmtree(run.checkpoints)
+    with pytest.raises(TrainingError, match="holds weights and no checkpoint to resume from"):
+        fit(killable(data), "", resume=run.path)
 
 
 def test_what_fails_before_its_first_step_does_not_take_the_folder(data, tmp_path, monkeypatch):

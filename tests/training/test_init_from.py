@@ -1,10 +1,12 @@
 """Training that starts from the weights of another run."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 
+from acwm_core.data.card import DatasetCard
 from acwm_core.errors import AcwmWarning, TrainingError
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
@@ -82,3 +84,43 @@ def test_weights_that_fit_are_taken_if_the_others_may_be_new(first, data, tmp_pa
         torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-7)
     message = next(str(each.message) for each in told if "has none that fit" in str(each.message))
     assert all(name in message for name in {*after} - fitting)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"fps": 30}, "the data has 30 frames/s, but .* was trained with 10 frames/s"),
+        ({"names": ("dy", "dx")}, "the actions dy, dx in this order"),
+        ({"names": ("vx", "vy")}, "the actions vx, vy, but"),
+        ({"units": ("m", "px")}, "dx in m, but .* with dx in px"),
+        ({"kind": "velocity"}, "actions of the kind velocity, but .* the kind delta"),
+    ],
+)
+def test_weights_of_other_actions_or_another_rate_are_refused(changed, said, first, data, tmp_path):
+    before = relabelled(data, tmp_path / "data", **changed)
+    recipe = tiny_recipe(before, **started_from(first))
+    with pytest.raises(TrainingError, match=said):
+        fit(recipe, tmp_path / "run")
+    anyway = tiny_recipe(
+        before, trainer={"max_steps": 1}, **started_from(first, ignore_mismatched_sizes=True)
+    )
+    with pytest.warns(AcwmWarning, match=said):
+        fit(anyway, tmp_path / "run")
+
+
+def test_other_bounds_are_reported(first, data, tmp_path):
+    wider = relabelled(data, tmp_path / "data", low=(-8.0, -4.0))
+    recipe = tiny_recipe(wider, trainer={"max_steps": 1}, **started_from(first))
+    with pytest.warns(AcwmWarning, match="the bounds of the actions are not those of"):
+        fit(recipe, tmp_path / "run")
+
+
+def relabelled(data, folder, **changed):
+    """The same episodes under another description."""
+    shutil.copytree(data, folder)
+    card = DatasetCard.read(folder)
+    environment = card.environment
+    rate = {name: changed.pop(name) for name in ("fps",) if name in changed}
+    action = replace(environment.action, **changed)
+    replace(card, environment=replace(environment, action=action, **rate)).write(folder)
+    return folder

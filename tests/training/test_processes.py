@@ -152,7 +152,7 @@ def test_a_signal_stops_the_processes_that_lightning_starts(strategy, data, tmp_
     done = train(data, run.path, resume="auto", trainer=flags)
     assert done.returncode == 75, done.stderr
     assert done.stderr.count("error: ") == 1
-    assert "stopped by SIGTERM, saved step 10; continue with resume=" in done.stderr
+    assert "stopped by SIGTERM, saved step 10; continue with `acwm fit resume=" in done.stderr
     assert "Traceback" not in done.stderr
     done = train(data, run.path, resume="auto", spared=True, trainer=flags)
     assert done.returncode == 0, done.stderr

@@ -22,7 +22,6 @@ SMALL_STEPS = (
     "trainer.accelerator=cpu",
     "trainer.log_every_n_steps=1",
     "trainer.enable_progress_bar=false",
-    "trainer.enable_checkpointing=false",
     "training.cpu_threads=1",
     "training.sample_every_n_steps=0",
     "data.batch_size=2",

@@ -8,9 +8,10 @@ import safetensors.torch
 import torch
 
 from acwm_core.errors import TrainingError
+from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run, load_weights, read_metadata, save_weights
 from acwm_core.training.run_folder import RunFolder
-from tests.tiny import tiny_world_model
+from tests.tiny import TinyModel, tiny_recipe, tiny_world_model
 from tests.training.runs import killable
 
 
@@ -76,3 +77,42 @@ def test_folders_that_hold_no_run_are_refused(tmp_path, copy):
     copy.weights.unlink()
     with pytest.raises(TrainingError, match="no trained weights"):
         load_run(copy.path)
+
+
+def test_tied_weights_come_back(tmp_path):
+    """Such as an embedding that is the output layer, too; safetensors refuses shared memory."""
+
+    def tied(seed):
+        world_model = tiny_world_model(seed)
+        world_model.model.twin = torch.nn.Linear(4, 8)
+        world_model.model.twin.weight = world_model.model.enter.weight
+        return world_model
+
+    there, back, path = tied(1), tied(2), tmp_path / "model.safetensors"
+    save_weights(path, there.state_dict(), there.codec.fingerprint(), step=7)
+    load_weights(back, path)
+    assert torch.equal(back.model.enter.weight, there.model.enter.weight)
+    assert back.model.twin.weight is back.model.enter.weight
+
+
+@pytest.mark.parametrize(
+    "value", [{"a": 1}, torch.eye(3).to_sparse(), torch.zeros(3, dtype=torch.complex32)]
+)
+def test_what_cannot_be_saved_is_refused_before_the_first_step(value, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(TinyModel, "get_extra_state", lambda self: value, raising=False)
+    monkeypatch.setattr(TinyModel, "set_extra_state", lambda *_: None, raising=False)
+    with pytest.raises(TrainingError, match=r"cannot be saved: .*model\._extra_state is a"):
+        fit(tiny_recipe(data), tmp_path / "run")
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+
+
+def test_the_scripts_default_precision_does_not_matter(whole):
+    first, actions = torch.rand(1, 3, 16, 16), torch.rand(1, 9, 2)
+    expected = load_run(whole.path).world_model.rollout(first, actions)
+    torch.set_default_dtype(torch.float64)
+    try:
+        world_model = load_run(whole.path).world_model
+        assert torch.equal(world_model.rollout(first, actions), expected)
+        assert torch.equal(world_model.rollout(first.double(), actions.double()), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)

@@ -90,6 +90,7 @@ def test_the_commands_compose():
         recipe, *words = shlex.split(command)
         if "--out" in words:
             del words[words.index("--out") : words.index("--out") + 2]
+        recipe = "push_cube" if recipe == "resume=runs/push_cube" else recipe
         composed = compose(recipe, [word for word in words if not word.startswith("resume=")])
         flags = composed.trainer
         clips = composed.data["batch_size"] * flags["devices"] * flags.get("num_nodes", 1)

@@ -55,7 +55,6 @@ def test_ours_make_room_for_the_users():
     bar = {"class_path": "lightning.pytorch.callbacks.RichProgressBar"}
     assert isinstance(build(ours, callbacks=[bar]).progress_bar_callback, RichProgressBar)
     assert build(ours, enable_progress_bar=False).progress_bar_callback is None
-    assert build(ours, enable_checkpointing=False).checkpoint_callbacks == []
 
 
 @pytest.mark.parametrize(
@@ -68,6 +67,13 @@ def test_ours_make_room_for_the_users():
         ({"devices": 0}, "devices"),
         ({"strategy": "dpp"}, "strategy='dpp'"),
         ({"gradient_clip_val": 1.0, "gradient_clip_algorithm": "nrom"}, "nrom"),
+        (
+            {"enable_checkpointing": False},
+            "leaves no model: leave out trainer.enable_checkpointing",
+        ),
+        ({"barebones": True}, "leaves no model"),
+        ({"max_steps": 0}, "trains nothing"),
+        ({"overfit_batches": 1}, "data.fraction"),
         ({"max_epochs": 3}, "set trainer.max_steps=… in place of trainer.max_epochs"),
         ({"max_steps": -1}, "nothing says how long to train"),
         ({"precision": "bf16-true"}, "use bf16-mixed"),
