@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import os
 import signal
@@ -243,12 +244,52 @@ def worker_context(*preload: str) -> ForkServerContext | SpawnContext:
     server, a process that does nothing but import the modules `preload`, and only once. They begin
     as new processes where frameworks of the system bear no fork (macOS, Windows), and in a process
     that was forked itself, as its server is not its child.
+
+    Raises:
+        DataError: the script that runs would start over in each worker, which imports it.
     """
+    _refuse_unguarded_script()
     if sys.platform != "linux" or _server_of not in (None, os.getpid()):
         return SpawnContext()
     context = _WorkerContext()
     context.set_forkserver_preload(["__main__", *preload])
     return context
+
+
+def _guards(node: ast.AST, line: int) -> bool:
+    """Whether a statement keeps a line from being run in processes that import the script."""
+    if not isinstance(node, ast.If):
+        return False
+    names = [each.id for each in ast.walk(node.test) if isinstance(each, ast.Name)]
+    if "__name__" not in names:
+        return False
+    return node.lineno <= line <= (node.end_lineno or line)
+
+
+def _refuse_unguarded_script() -> None:
+    """Refuse a script that does its work as it is imported, as every worker process imports it."""
+    main = sys.modules["__main__"]
+    file, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
+    if file is None or (spec is not None and spec.name.rpartition(".")[2] == "__main__"):
+        return  # of a console, or of a package: those are not imported
+    frame = sys._getframe()
+    while frame and not (frame.f_globals is vars(main) and frame.f_code.co_filename == file):
+        frame = frame.f_back
+    while frame and frame.f_code.co_name != "<module>":
+        frame = frame.f_back
+    if frame is None or frame.f_code.co_filename != file:
+        return
+    try:
+        tree = ast.parse(Path(file).read_text("utf-8"))
+    except (OSError, ValueError, SyntaxError):
+        return
+    if any(_guards(node, frame.f_lineno) for node in ast.walk(tree)):
+        return
+    raise DataError(
+        f"{file} starts worker processes in line {frame.f_lineno}, and each of them imports it "
+        'and would start over: put what it does below `if __name__ == "__main__":`, or ask for '
+        "no workers (workers=0)"
+    )
 
 
 @contextlib.contextmanager

@@ -10,21 +10,29 @@ import json
 import os
 import shutil
 import socket
+import stat
 import tempfile
+import time
 import warnings
 import zipfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from acwm_core.errors import AcwmError, DataError
+from acwm_core.errors import AcwmError, AcwmWarning, DataError
 
 T = TypeVar("T")
 
 PARTIAL, LOCK = ".partial", ".lock"
 
+CACHE = "ACWM_CACHE"
+"""Environment variable for the folder of `cache_folder`."""
+
 ENDING_SECONDS = 2.0
 """How long to wait for a killed command to release its folder before refusing."""
+
+NOTICE_SECONDS = 20.0
+"""How long to wait for another process before saying whom this one waits for."""
 
 OF_THE_DISK = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG),
@@ -37,6 +45,35 @@ FULL = 2**20
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
 """Errors of a file system without locks, as on some clusters."""
+
+
+def cache_folder() -> Path:
+    """The folder in which acwm keeps what it can make again; not made yet.
+
+    It is `$ACWM_CACHE`, else ``acwm`` in the user's cache folder, else, where the user has no home
+    that can be written to, as in some containers, a folder of the user's own in that of temporary
+    files.
+    """
+    import platformdirs
+
+    if chosen := os.environ.get(CACHE):
+        return Path(chosen)
+    usual = platformdirs.user_cache_path("acwm")
+    if usual.is_absolute() and is_writable(usual):
+        return usual
+    own = Path(tempfile.gettempdir(), f"acwm-{os.getuid()}")
+    own.mkdir(mode=0o700, exist_ok=True)
+    status = own.lstat()
+    if status.st_uid != os.getuid() or not stat.S_ISDIR(status.st_mode):  # it could be anybody's
+        raise DataError(f"{own} belongs to another user: set {CACHE} to a folder for acwm's cache")
+    return own
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether files can be written into `folder`, or into the folder where it would be made."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
 
 @contextlib.contextmanager
@@ -119,8 +156,13 @@ def made_whole(folder: Path) -> Generator[Path]:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Generator[None]:
-    """Turn system errors about writing to `path` into a `DataError`."""
+def writing(path: Path, instead: str = "") -> Generator[None]:
+    """Turn system errors about writing to `path` into a `DataError`.
+
+    Args:
+        path: what is written.
+        instead: a phrase that says what to do without it.
+    """
     try:
         yield
     except Exception as error:
@@ -129,7 +171,7 @@ def writing(path: Path) -> Generator[None]:
             raise
         raise DataError(
             f"cannot write to {path} ({found.strerror or found}): free disk space or fix the "
-            "permissions, and run the same command again to resume"
+            f"permissions, and run the same command again to resume{', ' * bool(instead)}{instead}"
         ) from error
 
 
@@ -179,11 +221,12 @@ def held(folder: Path, told: Path | None = None) -> Generator[None]:
     Raises:
         DataError: another process holds the lock.
     """
-    with _locked(folder / LOCK, ENDING_SECONDS) as is_held:
+    lock = folder / LOCK
+    with _locked(lock, ENDING_SECONDS) as is_held:
         if not is_held:
             raise DataError(
                 f"another command is writing to {told or folder}; wait for it or choose another "
-                "folder"
+                f"folder{_holder(lock)}"
             )
         yield
 
@@ -201,7 +244,16 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
     Yields:
         Whether this process holds the lock. A previous holder may have made the file already.
     """
-    with _locked(path.with_name(f".{path.name}{LOCK}"), -1 if wait else 0) as is_held:
+    lock = path.with_name(f".{path.name}{LOCK}")
+    if wait:
+        with _locked(lock, NOTICE_SECONDS) as is_held:
+            if is_held:
+                remove_partial(path.parent, f"{path.name}.")
+                yield True
+                return
+        message = f"waiting for another command, which is making {path}{_holder(lock)}"
+        warnings.warn(message, AcwmWarning, stacklevel=3)
+    with _locked(lock, -1 if wait else 0) as is_held:
         if is_held:
             remove_partial(path.parent, f"{path.name}.")
         yield is_held
@@ -222,9 +274,37 @@ def _locked(path: Path, seconds: float) -> Generator[bool]:
         if error.errno not in NO_LOCKS:
             raise
     try:
+        _sign(path)
         yield True
     finally:
         lock.release()
+
+
+def _sign(lock: Path) -> None:
+    """Write into a lock that is held who holds it: process and host, as filelock itself does where
+    a file system has no locks."""
+    with contextlib.suppress(OSError):  # only messages need it
+        owner = f"{os.getpid()}\n{socket.gethostname()}\n"
+        if not lock.read_text("utf-8", "replace").startswith(owner):
+            lock.write_text(owner, encoding="utf-8")
+
+
+def _holder(lock: Path) -> str:
+    """Who holds a lock, since when, and how to break it, in brackets; empty if nothing is known.
+
+    A lock ends with its process, but the file system of a cluster may keep one whose node was lost.
+    """
+    try:
+        pid, host = lock.read_text("utf-8", "replace").splitlines()[:2]
+        seconds = max(0.0, time.time() - lock.stat().st_mtime)
+    except (OSError, ValueError):
+        return ""
+    age = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    age = age if seconds < 6000 else f"{seconds / 3600:.0f} h"
+    is_here = host == socket.gethostname()
+    holder = f"process {pid} on {'this machine' if is_here else host} has held it for {age}"
+    way_out = "" if is_here and _runs(pid) else f"; if that has ended, delete {lock} and try again"
+    return f" ({holder}{way_out})"
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -1,7 +1,8 @@
 """Latents of clips: encoded once by a frozen codec, kept beside the clips, read at memory speed.
 
 They lie in ``DATA/latents/<codec fingerprint>/<split>-<frames>x<stride>-<data checksum>/``, one
-float16 array ``[clips, L, C, h, w]`` per shard. Latents of transformed clips are in a folder of
+float16 array ``[clips, L, C, h, w]`` per shard; those of a dataset that cannot be written to lie in
+the user's cache. Latents of transformed clips are in a folder of
 their own, whose name ends with the symmetry's: to transform latents would not be exact. A card in
 each folder repeats these facts, so that a renamed or copied folder is not misread.
 
@@ -12,10 +13,12 @@ waiting in a collective operation would time out.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +32,19 @@ from torch import Tensor
 from acwm_core.data.clips import Clips, padded_video, window_starts
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.symmetry import Symmetry
-from acwm_core.errors import DataError, noting
+from acwm_core.errors import AcwmWarning, DataError, noting
 from acwm_core.executors import Report, progress_bar
-from acwm_core.files import alone, parse_json, writing, written_whole
+from acwm_core.files import (
+    CACHE as CACHE_VARIABLE,
+)
+from acwm_core.files import (
+    alone,
+    cache_folder,
+    is_writable,
+    parse_json,
+    writing,
+    written_whole,
+)
 from acwm_core.model.codec import Codec
 from acwm_core.model.precision import bfloat16_is_fast
 
@@ -42,6 +55,11 @@ CARD = "latents.json"
 def compresses(codec: Codec) -> bool:
     """Whether float16 latents take less space than the 8-bit frames they encode."""
     return 2 * codec.channels < 3 * codec.spatial_stride**2 * codec.temporal_stride
+
+
+def shard_name(number: int) -> str:
+    """The name of the file with the latents of a shard."""
+    return f"shard-{number:05d}.npy"
 
 
 @dataclass(frozen=True)
@@ -58,17 +76,22 @@ class LatentFolder:
         if not re.fullmatch(r"\w[\w.-]*", str(self.fingerprint)):
             raise DataError(f"the codec has the fingerprint {self.fingerprint!r}, not a valid name")
 
-    @property
+    @functools.cached_property
     def path(self) -> Path:
-        """The folder."""
+        """The folder: beside the clips, or in the user's cache if nothing can be written there."""
         episodes = self.episodes
         windows = f"{episodes.split}-{self.frames}x{self.stride}-{episodes.checksum[:12]}"
         windows += f"-{self.symmetry.name}" if self.symmetry else ""
-        return episodes.path / LATENTS / str(self.fingerprint) / windows
+        name = Path(LATENTS, str(self.fingerprint), windows)
+        beside = episodes.path / name
+        shards = range(len(episodes.shards))
+        if is_writable(beside) or all((beside / shard_name(each)).exists() for each in shards):
+            return beside
+        return cache_folder() / name
 
     def file(self, number: int) -> Path:
         """The file of shard `number`."""
-        return self.path / f"shard-{number:05d}.npy"
+        return self.path / shard_name(number)
 
     def unfinished(self) -> list[int]:
         """Shards without latents."""
@@ -139,7 +162,15 @@ def encode_windows(
         ShapeError: the codec cannot encode frames of this size.
     """
     folder = LatentFolder(episodes, codec.latents_fingerprint(), frames, stride, symmetry)
-    with writing(folder.path), contextlib.ExitStack() as stack:
+    if progress and not folder.path.is_relative_to(episodes.path):
+        warnings.warn(
+            f"{episodes.path} cannot be written to, so its latents are kept in {folder.path} (set "
+            f"{CACHE_VARIABLE} for another place, or data.cache_latents=false to keep none)",
+            AcwmWarning,
+            stacklevel=2,
+        )
+    instead = "or train without by data.cache_latents=false"
+    with writing(folder.path, instead), contextlib.ExitStack() as stack:
         folder.path.mkdir(parents=True, exist_ok=True)
         folder.keep_card()
         total = sum(episodes.shards[number][1] for number in folder.unfinished())

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
@@ -20,6 +23,9 @@ WORKER_DIED = (
     "a process that reads data died, perhaps out of memory: run the same command again with "
     "resume=auto, and with fewer data.workers if it happens again"
 )
+
+SHARED = Path("/dev/shm")
+"""Where Linux keeps memory that processes share."""
 
 
 def epoch_order(length: int, seed: int, epoch: int, stream: int = 0) -> NDArray[np.int64]:
@@ -174,6 +180,7 @@ class ClipLoader:
             clips if streams else _Batches(clips),
             batch_size=None,
             sampler=None if streams else sampler,
+            collate_fn=_shared if workers else None,
             num_workers=workers,
             multiprocessing_context=self._context,
             pin_memory=pin_memory,
@@ -204,6 +211,26 @@ class ClipLoader:
                     sys.stderr.write(f"acwm: {batch}\n")
                 raise batch
             yield {**batch, "positions": next(places)}
+
+
+def _shared(batch: Any) -> Any:
+    """Move a batch to memory that is shared with the training process, in which it is sent.
+
+    PyTorch does so by itself, in a thread whose error nobody sees: training would wait for ever.
+    """
+    if isinstance(batch, DataError):
+        return batch
+    try:
+        for value in batch.values():
+            cast(torch.Tensor, value).share_memory_()
+    except RuntimeError as error:
+        total = f" of {shutil.disk_usage(SHARED).total / 2**20:.0f} MB" if SHARED.exists() else ""
+        return DataError(
+            f"the shared memory {SHARED}{total}, through which workers send clips, is full: give a "
+            "container more by --shm-size=8g, or set data.workers=0 or a smaller data.batch_size "
+            f"({str(error).splitlines()[0][:80]})"
+        )
+    return batch
 
 
 class _Batches(Dataset[Any]):

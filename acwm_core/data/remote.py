@@ -9,22 +9,16 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import os
 import re
 import tempfile
 import time
 from pathlib import Path
 from typing import Any, cast
 
-import platformdirs
-
 from acwm_core.data.card import CARD, MANIFEST, DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, MissingExtraError
-from acwm_core.files import OF_THE_DISK, alone, written_whole
-
-CACHE = "ACWM_CACHE"
-"""Environment variable for the cache folder; the default is ``acwm`` in the user's cache folder."""
+from acwm_core.files import CACHE, OF_THE_DISK, alone, cache_folder, written_whole
 
 ORIGIN = ".origin"
 WAITS = (0.5, 2.0, 8.0)
@@ -42,11 +36,6 @@ PROTOCOLS = {
 """Supported URL protocols, and the package that reads each."""
 
 URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
-
-
-def cache_folder() -> Path:
-    """The folder in which acwm caches files for the user."""
-    return Path(os.environ.get(CACHE) or platformdirs.user_cache_path("acwm"))
 
 
 def data_folder(path: str | Path) -> Path:

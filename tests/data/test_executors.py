@@ -1,7 +1,10 @@
 """Executors by name: a foreign one makes the same bytes, and gets its options from the command."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
+import pytest
 from click.testing import CliRunner
 from conftest import EPISODES, checksums
 
@@ -66,3 +69,40 @@ def test_without_a_terminal_progress_is_told_in_lines(monkeypatch, capsys):
     with executors.progress_bar("hidden", 2, shown=False) as report:
         report(2)
     assert capsys.readouterr().err == ""
+
+
+UNGUARDED = """
+from acwm_core.executors import LocalExecutor
+
+
+def double(task, report):
+    return 2 * task
+
+
+def work():
+    print(sorted(LocalExecutor(2).run(double, [1, 2], print)))
+
+
+{call}
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "works"),
+    [
+        ("work()", False),
+        ("if len('always'):\n    work()", False),
+        ("if __name__ == '__main__':\n    print()\nwork()", False),
+        ("if __name__ == '__main__':\n    work()", True),
+    ],
+)
+def test_a_script_that_workers_would_run_again_is_refused(call, works, tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text(UNGUARDED.format(call=call))
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100)
+    if works:
+        assert "[2, 4]" in done.stdout, done.stderr
+    else:
+        last = done.stderr.splitlines()[-1]
+        assert 'put what it does below `if __name__ == "__main__":`' in last
+        assert "memory" not in done.stderr

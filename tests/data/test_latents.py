@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from acwm_core.data.clips import ClipDataset
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.data.latents import LatentClipDataset, compresses, encode_windows
-from acwm_core.errors import DataError, ShapeError
+from acwm_core.errors import AcwmWarning, DataError, ShapeError
 
 
 @pytest.fixture
@@ -151,3 +152,22 @@ def test_only_latents_smaller_than_frames_are_worth_keeping():
     wide = Blocks()
     wide.channels = 3 * 8 * 8 * 4
     assert not compresses(wide)
+
+
+def test_latents_of_data_that_cannot_be_written_to_are_kept_in_the_cache(
+    data, tmp_path, monkeypatch
+):
+    """As on a shared disk; training reads them from where they are."""
+    beside = encode(data, Blocks(), frames=9)[3]["latents"]
+    shutil.rmtree(data.path / "latents")
+    monkeypatch.setenv("ACWM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("acwm_core.data.latents.is_writable", lambda _: False)
+    with pytest.warns(AcwmWarning, match=r"cannot be written to.*ACWM_CACHE.*cache_latents=false"):
+        folder = encode_windows(data, Blocks(), frames=9)
+    assert folder.is_relative_to(tmp_path / "cache")
+    assert not (data.path / "latents").exists()
+    kept = LatentClipDataset(data, Blocks().fingerprint(), frames=9)[3]["latents"]
+    torch.testing.assert_close(kept, beside, rtol=0, atol=0)
+    monkeypatch.setenv("ACWM_CACHE", str(data.path / "card.yaml" / "cache"))
+    with pytest.raises(DataError, match=r"train without by data\.cache_latents=false"):
+        encode_windows(data, Blocks(gain=2.0), frames=9, progress=False)

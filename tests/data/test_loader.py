@@ -1,6 +1,8 @@
 """The order of clips: every clip once per epoch, of all ranks together, and exact resume."""
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -115,3 +117,40 @@ def test_in_order_every_clip_comes_once_longest_first():
 def test_nothing_to_sample_is_refused():
     with pytest.raises(ValueError, match="no clips"):
         ClipSampler(0, batch_size=2)
+
+
+FULL = """
+import torch
+from acwm_core.data.loader import ClipLoader, ClipSampler
+from acwm_core.errors import DataError
+
+
+class Clips:
+    def batch(self, indices):
+        return {"video": torch.zeros(len(indices), 512, 1024, dtype=torch.uint8)}
+
+
+if __name__ == "__main__":
+    try:
+        for _ in zip(range(20), ClipLoader(Clips(), ClipSampler(8, batch_size=4), workers=2)):
+            pass
+    except DataError as error:
+        print(error)
+"""
+
+
+@pytest.mark.ci
+def test_full_shared_memory_is_one_sentence_and_no_hang(tmp_path):
+    """With that of a container, in a mount namespace of its own."""
+    script = tmp_path / "full.py"
+    script.write_text(FULL)
+    mount = "mount -t tmpfs -o size=4m tmpfs /dev/shm"
+    if subprocess.run(["unshare", "-m", "sh", "-c", mount], capture_output=True).returncode:
+        pytest.skip("mounts need privileges")
+    command = f"{mount} && exec {sys.executable} {script}"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", command], capture_output=True, text=True, timeout=100
+    )
+    assert "/dev/shm of 4 MB" in done.stdout, done.stderr
+    assert "--shm-size" in done.stdout
+    assert "data.workers=0" in done.stdout

@@ -1,7 +1,10 @@
 """Two commands at once on one folder: the second is told in one sentence, and changes nothing."""
 
+import fcntl
+import os
 import shutil
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -133,3 +136,24 @@ def test_two_take_the_same_copy_of_a_trained_model(run, tmp_path, monkeypatch):
         monkeypatch.setattr(shutil, "copytree", None)
     second.join()
     assert found == [copy]
+
+
+def test_a_lock_of_a_lost_node_says_whose_it_is_and_the_way_out(tmp_path):
+    """The file system of a cluster may keep a lock whose process has ended on another node."""
+    lock = tmp_path / ".lock"
+    with lock.open("w") as left:
+        left.write("4711\nnode7\n")
+        left.flush()
+        fcntl.flock(left, fcntl.LOCK_EX)
+        os.utime(lock, (time.time() - 3 * 3600,) * 2)
+        with pytest.raises(DataError) as refused, held(tmp_path):
+            pass
+        way_out = f"process 4711 on node7 has held it for 3 h; if that has ended, delete {lock}"
+        assert way_out in str(refused.value)
+        lock.unlink()
+        with (
+            held(tmp_path),
+            pytest.raises(DataError, match=r"on this machine has held it for \d s\)$"),
+            held(tmp_path),
+        ):
+            pass
