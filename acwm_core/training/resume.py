@@ -89,7 +89,8 @@ def _differences(run: RunFolder, recipe: Recipe, card: DatasetCard, last: Path |
     found = [each for each in found if not each.startswith("data.path ")]
     before = DatasetCard.read(run.card)
     if before.has_data_of(card):
-        return found
+        scene = before.environment.contradictions(card.environment)
+        return [*found, *(f"the dataset's card says otherwise of its {name} now" for name in scene)]
     others = [each for each in before.differences(card) if not each.startswith("source.")]
     why = few(others, 1) if others else "other recordings"
     return [*found, f"{recipe.data['path']} holds other data ({why})"]
