@@ -164,7 +164,7 @@ def _check_saved(run: RunFolder, trainer: L.Trainer) -> None:
 
 
 def _check_meaning(config: TrainingConfig, card: EnvironmentCard) -> None:
-    """Refuse to start from weights of other actions, unless any may be taken; tell other bounds."""
+    """Refuse to start from weights of other actions, unless any may be taken; report bounds."""
     name = str(config.init_from)
     initial = RunFolder(find_run(name))
     if not initial.card.is_file():
