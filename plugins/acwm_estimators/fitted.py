@@ -8,7 +8,6 @@ world appear in the frame.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,10 @@ from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.physics import Physics, Reading, Symmetry
+from acwm_core.env.physics import Physics, Reading
+from acwm_core.env.state_field import BodySymmetry
 from acwm_core.errors import DataError
+from acwm_estimators.camera import FittedCamera, with_ones
 from acwm_estimators.layout import Layout, Local, Points
 
 Array = NDArray[np.float64]
@@ -42,42 +43,6 @@ SAMPLES = 1500
 
 LEAST = 0.002
 """Share of the frame that a mask must cover for its middle to count."""
-
-
-@dataclass(frozen=True)
-class FittedCamera:
-    """A projection of the world into the frame, see `acwm_core.env.physics.ViewingCamera`.
-
-    Attributes:
-        matrix: rows of the 3 × 4 matrix that takes (x, y, z, 1) to (u·w, v·w, w), where u points
-            right and v down from the frame's centre in frame heights.
-        constant: the coordinates that never change, by axis.
-    """
-
-    matrix: tuple[tuple[float, ...], ...]
-    constant: tuple[tuple[int, float], ...] = ()
-
-    def to_frame(self, points: Array) -> Array:
-        """Points `[…, 3]` to u, v and w `[…, 3]`."""
-        seen = _with_ones(points) @ np.array(self.matrix).T
-        return np.concatenate([seen[..., :2] / seen[..., 2:], seen[..., 2:]], -1)
-
-    def from_frame(self, seen: Array) -> Array:
-        """The inverse of `to_frame`."""
-        matrix = np.array(self.matrix)
-        scaled = np.concatenate([seen[..., :2] * seen[..., 2:], seen[..., 2:]], -1)
-        found = (scaled - matrix[:, 3]) @ np.linalg.pinv(matrix[:, :3]).T
-        for axis, value in self.constant:
-            found[..., axis] = value
-        return found
-
-    def on_plane(self, seen: Array, height: float) -> Array:
-        """Where rays through u, v `[…, 2]` meet the plane z = `height`: `[…, 3]`."""
-        matrix = np.array(self.matrix)
-        flat = np.column_stack([matrix[:, :2], matrix[:, 2] * height + matrix[:, 3]])
-        found = _with_ones(seen) @ np.linalg.inv(flat).T
-        ground = found[..., :2] / found[..., 2:]
-        return np.concatenate([ground, np.full_like(ground[..., :1], height)], -1)
 
 
 def fitted_layout(
@@ -131,12 +96,12 @@ def fitted_layout(
 def fitted_physics(layout: Layout) -> Physics:
     """What can be measured: the positions and angles, of bodies that are one piece each."""
     owners = {points.field: points.instances for points in layout.points}
-    turns: dict[int, Symmetry] = {2: "half_turn", 4: "quarter_turn"}
+    turns: dict[int, BodySymmetry] = {2: "half_turn", 4: "quarter_turn"}
     readings = [Reading(points.field, "position", points.instances) for points in layout.points]
     for local in layout.locals:
         names = owners[local.under][: local.count]
         readings.append(Reading(local.field, "angle", names, turns.get(local.fold, "none")))
-    return Physics(readings=tuple(readings), camera=layout.camera)
+    return Physics(readings=tuple(readings))
 
 
 def layout_from_dict(values: Mapping[str, Any]) -> Layout:
@@ -186,7 +151,7 @@ def _owner(values: Array, middles: Mapping[str, Array]) -> str | None:
         there = np.isfinite(middle).all(1) & np.isfinite(values).all(1)
         if there.sum() < FEWEST:
             continue
-        known, wanted = _with_ones(values[there]), middle[there]
+        known, wanted = with_ones(values[there]), middle[there]
         map_, *_ = np.linalg.lstsq(known, wanted, rcond=None)
         off, moves = (
             float(np.sqrt((each**2).sum(1).mean()))
@@ -212,7 +177,7 @@ def _camera(pairs: Sequence[tuple[Array, Array]]) -> FittedCamera:
         seen.append(middle[there])
     points, targets = np.concatenate(world), np.concatenate(seen)
     centre, scale = points.mean(0), points.std(0).max() + 1e-9
-    flat = _with_ones((points - centre) / scale)
+    flat = with_ones((points - centre) / scale)
     spread = points.std(0)
     used = [axis for axis in range(3) if spread[axis] > FLAT * spread.max()] + [3]
     flat = flat[:, used]
@@ -228,7 +193,7 @@ def _camera(pairs: Sequence[tuple[Array, Array]]) -> FittedCamera:
     matrix[:, used] = found
     matrix[:, :3] /= scale
     matrix[:, 3] -= matrix[:, :3] @ centre
-    depth = _with_ones(points) @ matrix[2]
+    depth = with_ones(points) @ matrix[2]
     matrix /= depth.mean()  # w is about 1, and positive
     constant = tuple((axis, float(points[:, axis].mean())) for axis in {0, 1, 2} - {*used})
     return FittedCamera(tuple(tuple(float(value) for value in row) for row in matrix), constant)
@@ -244,7 +209,3 @@ def _angle(name: str, fold: int, points: Sequence[Points], card: EnvironmentCard
     if under is None:
         raise DataError(f"{name} has {count} angles, and no position that is read as many rows")
     return Local(name, under.field, count, "angle", fold=fold, whole=True)
-
-
-def _with_ones(points: Array) -> Array:
-    return np.concatenate([points, np.ones_like(points[..., :1])], -1)

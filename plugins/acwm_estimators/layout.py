@@ -16,6 +16,7 @@ from acwm_core.env.physics import Physics
 from acwm_core.env.rotations import FOLDS
 from acwm_core.env.state_field import SYMMETRIES
 from acwm_core.errors import PluginError
+from acwm_estimators.camera import FittedCamera
 from acwm_estimators.limits import ideal_physics_of
 from acwm_estimators.plugin import WEIGHTS
 
@@ -136,7 +137,7 @@ class Layout:
         curves: bodies that are traced through masks.
     """
 
-    camera: Camera
+    camera: Camera | FittedCamera
     instances: tuple[str, ...]
     points: tuple[Points, ...]
     locals: tuple[Local, ...] = ()
