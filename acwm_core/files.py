@@ -58,9 +58,10 @@ def cache_folder() -> Path:
 
     if chosen := os.environ.get(CACHE):
         return Path(chosen)
-    usual = platformdirs.user_cache_path("acwm")
-    if usual.is_absolute() and is_writable(usual):
-        return usual
+    with contextlib.suppress(RuntimeError):  # a user without an account has no home
+        usual = platformdirs.user_cache_path("acwm")
+        if usual.is_absolute() and is_writable(usual):
+            return usual
     own = Path(tempfile.gettempdir(), f"acwm-{os.getuid()}")
     own.mkdir(mode=0o700, exist_ok=True)
     status = own.lstat()

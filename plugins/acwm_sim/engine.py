@@ -26,18 +26,18 @@ CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
 _VARIABLES = ("TI_", "ENABLE_TAICHI")  # they change results, and where and how fast it computes
 
 
-def _home() -> dict[str, str]:
-    """A home for Taichi, which aborts the process without one."""
-    if "HOME" in os.environ:
-        return {}
-    try:
-        return {"HOME": str(Path.home())}
-    except RuntimeError:  # a user without an account, as in some containers
-        return {"HOME": str(cache_folder())}
+def _give_home() -> None:
+    """Name a home to Taichi, which asks for it again and again and aborts a process without one."""
+    if "HOME" not in os.environ:
+        try:
+            os.environ["HOME"] = str(Path.home())
+        except RuntimeError:  # a user without an account, as in some containers
+            os.environ["HOME"] = str(cache_folder())
 
 
+_give_home()
 try:
-    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0", **_home()):
+    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0"):
         import taichi as ti
         from taichi.lang import impl, kernel_impl
         from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
@@ -178,11 +178,10 @@ def _initialise() -> None:
 
 def _cache() -> Path:
     """The folder of compiled kernels; a temporary one, with a warning, if none can be written."""
-    folders = [Path(os.environ.get(CACHE, ""))]
-    if CACHE not in os.environ:
-        with undisturbed(*_VARIABLES, **_home()):
-            usual = impl.default_cfg().offline_cache_file_path
-        folders = [Path(usual), cache_folder() / "taichi"]
+    if chosen := os.environ.get(CACHE):
+        folders = [Path(chosen)]
+    else:
+        folders = [Path(impl.default_cfg().offline_cache_file_path), cache_folder() / "taichi"]
     why = ""
     for folder in folders:
         try:
