@@ -175,10 +175,16 @@ def _value(value: float | int | str) -> str:
 
 def _state(state: tuple[StateField, ...]) -> str:
     rows = [
-        (f"`{f.name}`", "×".join(map(str, f.shape)) or "1", f.unit or "–", f.description)
+        (
+            f"`{f.name}`",
+            "×".join(map(str, f.shape)) or "1",
+            f.unit or "–",
+            " and ".join(f.kinds),
+            f.description,
+        )
         for f in state
     ]
-    return _table(("State", "Shape", "Unit", "Meaning"), rows)
+    return _table(("State", "Shape", "Unit", "Kind", "Meaning"), rows)
 
 
 def _changed_state(card: EnvironmentCard, base: EnvironmentCard) -> list[str]:

@@ -31,11 +31,13 @@ class Points:
             pixels.
         plane: height z in metres of the plane of two-dimensional positions. None reads three
             dimensions, with the depth from a map.
+        present: state field that is 1 for rows that exist; empty if all do.
     """
 
     field: str
     instances: tuple[str, ...]
     plane: float | None = None
+    present: str = ""
 
     @property
     def rows(self) -> int:
@@ -167,7 +169,7 @@ def _points(physics: Physics, name: str, *instances: str) -> Points:
     """The positions in a field, with its own instances or those in whose pixels they are read."""
     field = physics.fields[name]
     plane = field.height if field.shape[-1] == 2 else None
-    return Points(name, instances or field.owners, plane)
+    return Points(name, instances or field.owners, plane, field.present)
 
 
 def _turns(physics: Physics, name: str, under: str) -> Local:

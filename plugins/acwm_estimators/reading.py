@@ -106,9 +106,8 @@ def _derived(
     derived: dict[str, Array] = {}
     shapes = {field.name: field.shape for field in card.state}
     for points in layout.points:
-        present = points.field.removesuffix("_position") + "_present"
-        if present in shapes:
-            derived[present] = points_there(masks, points, card, MIN_SEEN)
+        if points.present in shapes:
+            derived[points.present] = points_there(masks, points, card, MIN_SEEN)
     if {"elbow_position", "fingertip_position", "joint_angle"} <= {*states, *shapes}:
         upper, fore = states["elbow_position"], states["fingertip_position"]
         shoulder = np.arctan2(upper[:, 1], upper[:, 0])

@@ -7,15 +7,13 @@ from numpy.typing import NDArray
 
 from acwm_core.env.physics import Physics, Reading
 from acwm_core.env.rotations import FOLDS, product, rotations_of
-from acwm_core.env.state_field import BodySymmetry
+from acwm_core.env.state_field import SYMMETRIES, BodySymmetry
 from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means
 from acwm_metrics.seen import exist, held_of, seen_of, share_found, shown
 
 LARGEST = {
-    "none": np.pi,
-    "half_turn": np.pi / 2,
-    "quarter_turn": np.pi / 4,
+    **{symmetry: np.pi / FOLDS[symmetry] for symmetry in SYMMETRIES["angle"]},
     "box": 2 * np.pi / 3,
     "cube": 2 * np.arccos((1 + 2**0.5) / 8**0.5),
 }

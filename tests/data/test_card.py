@@ -1,12 +1,15 @@
 """The dataset card: round trip, what is refused, differences by name."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import yaml
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import DataError
+
+EARLIER = Path(__file__).parents[1] / "reference" / "second_release" / "data"
 
 
 def test_a_card_comes_back_from_its_file(square_data, tmp_path):
@@ -27,6 +30,36 @@ def test_a_card_of_a_later_layout_is_refused(square_data, tmp_path):
     values = yaml.safe_load((square_data / "card.yaml").read_text())
     (tmp_path / "card.yaml").write_text(yaml.safe_dump({**values, "format": 2}))
     with pytest.raises(DataError, match="layout version 2, this acwm reads 1"):
+        DatasetCard.read(tmp_path)
+
+
+def test_a_card_of_an_earlier_release_is_that_of_the_same_data():
+    push_cube = pytest.importorskip("acwm_rigid.push_cube").PushCube
+    there = DatasetCard.read(EARLIER)
+    assert {each.kind for each in there.environment.state} == {"value"}
+    now = replace(there, environment=push_cube(size=64).card)
+    assert there.differences(now) == now.differences(there) == []
+    assert there.identity == now.identity
+    assert now.environment.completed_by(there.environment) == now.environment
+    assert there.environment.completed_by(now.environment).camera == now.environment.camera
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"kind": "place"},
+        {"kind": 3},
+        {"symmetry": "cube"},
+        {"height": "0.1"},
+        {"instances": "square"},
+        {"present": "there"},
+    ],
+)
+def test_a_wrong_declaration_in_a_card_that_was_edited_is_refused(square_data, tmp_path, wrong):
+    values = yaml.safe_load((square_data / "card.yaml").read_text())
+    values["environment"]["state"][0] |= wrong
+    (tmp_path / "card.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(DataError, match="is not a dataset card"):
         DatasetCard.read(tmp_path)
 
 
