@@ -29,9 +29,10 @@ class Symmetry:
         mirrored: whether frames are mirrored, left to right.
         quarter_turns: by how many quarter turns, 0 to 3, they are turned after that,
             counter-clockwise.
-        states: how it transforms the last axis of fields of the state; those that do not transform
-            so simply are left out.
-        headings: fields of the state that hold angles in the plane of the frame, in rad and
+        states: how it transforms the last axis of fields of the state whose kind does not tell, as
+            of values (`acwm_core.env.states.transform`); those that do not transform so simply are
+            left out.
+        headings: fields of the state that hold directions in the plane of the frame, in rad and
             counter-clockwise from the right. They turn with it.
         repainted: instances whose colours change, and change back when it is done twice, as those
             of a cloth whose sides change places.

@@ -21,9 +21,65 @@ PUSHER_HEIGHT = 0.05
 """Half the height of push_cube's pushers, metres."""
 
 
+_THERE = "cube_present"
+
+_CUBE_STATE = (
+    StateField(
+        "cube_present",
+        (MAX_CUBES,),
+        "",
+        "1 for a cube that is there; others are zero",
+        "presence",
+        CUBES,
+    ),
+    StateField(
+        "cube_position",
+        (MAX_CUBES, 3),
+        "m",
+        "centre in the table's frame, z up",
+        "position",
+        CUBES,
+        _THERE,
+    ),
+    StateField(
+        "cube_quaternion",
+        (MAX_CUBES, 4),
+        "",
+        "orientation (w, x, y, z)",
+        "quaternion",
+        CUBES,
+        _THERE,
+        symmetry="cube",
+        follows=("cube_yaw",),
+    ),
+    StateField(
+        "cube_yaw",
+        (MAX_CUBES,),
+        "rad",
+        "heading around z, in [-π, π]",
+        "angle",
+        CUBES,
+        _THERE,
+        symmetry="quarter_turn",
+        axis=(0, 0, 1),
+    ),
+    StateField(
+        "cube_velocity", (MAX_CUBES, 3), "m/s", "velocity of the centre", "vector", CUBES, _THERE
+    ),
+    StateField(
+        "cube_angular_velocity",
+        (MAX_CUBES, 3),
+        "rad/s",
+        "in the table's frame",
+        "value",
+        CUBES,
+        _THERE,
+    ),
+)
+
+
 def push_cube_state(pushers: tuple[str, ...]) -> tuple[StateField, ...]:
     """The state of push_cube with pushers of these names."""
-    n, there = MAX_CUBES, "cube_present"
     return (
         StateField(
             "pusher_position",
@@ -42,51 +98,7 @@ def push_cube_state(pushers: tuple[str, ...]) -> tuple[StateField, ...]:
             "vector",
             pushers,
         ),
-        StateField(
-            "cube_present",
-            (n,),
-            "",
-            "1 for a cube that is there; others are zero",
-            "presence",
-            CUBES,
-        ),
-        StateField(
-            "cube_position",
-            (n, 3),
-            "m",
-            "centre in the table's frame, z up",
-            "position",
-            CUBES,
-            there,
-        ),
-        StateField(
-            "cube_quaternion",
-            (n, 4),
-            "",
-            "orientation (w, x, y, z)",
-            "quaternion",
-            CUBES,
-            there,
-            symmetry="cube",
-            follows=("cube_yaw",),
-        ),
-        StateField(
-            "cube_yaw",
-            (n,),
-            "rad",
-            "heading around z, in [-π, π]",
-            "angle",
-            CUBES,
-            there,
-            symmetry="quarter_turn",
-            axis=(0, 0, 1),
-        ),
-        StateField(
-            "cube_velocity", (n, 3), "m/s", "velocity of the centre", "vector", CUBES, there
-        ),
-        StateField(
-            "cube_angular_velocity", (n, 3), "rad/s", "in the table's frame", "value", CUBES, there
-        ),
+        *_CUBE_STATE,
     )
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +11,16 @@ from PIL import Image, ImageSequence
 from tensorboard.backend.event_processing import event_accumulator
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import ClipDataset
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import AcwmWarning, TrainingError
+from acwm_core.recipe import Recipe
 from acwm_core.training.callbacks import CpuTime
 from acwm_core.training.fit import fit
 from acwm_core.training.module import VALIDATION_NOISE, generator_of
 from acwm_core.training.precision import automatic_precision
+from acwm_core.training.resume import checkpoint_to_resume
 from acwm_core.training.run import load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
 from acwm_metrics.torchmetrics import as_torchmetric
@@ -264,6 +268,24 @@ def test_data_of_another_environment_is_refused(data, tmp_path):
     with pytest.raises(TrainingError, match=r"frames of 16×16: leave out env\.size"):
         fit(tiny_recipe(data, env={"size": 32}), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_card_may_say_more_of_the_scene_when_a_run_resumes_and_not_otherwise(
+    whole, data, tmp_path
+):
+    run, recipe = RunFolder(tmp_path / "run"), Recipe.from_yaml(whole.recipe)
+    shutil.copytree(whole.path, run.path)
+    card = DatasetCard.read(data)
+    (position,) = card.environment.state
+    declared, otherwise = (
+        replace(card, environment=replace(card.environment, state=(replace(position, kind=kind),)))
+        for kind in ("position", "vector")
+    )
+    assert checkpoint_to_resume(run, recipe, declared, run.path) == run.last_checkpoint
+    declared.write(run.path)
+    assert checkpoint_to_resume(run, recipe, card, run.path) == run.last_checkpoint
+    with pytest.raises(TrainingError, match="otherwise of its state position"):
+        checkpoint_to_resume(run, recipe, otherwise, run.path)
 
 
 def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
