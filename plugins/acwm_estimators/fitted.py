@@ -81,7 +81,7 @@ def fitted_layout(
         if all(owners):
             names = tuple(name for name in owners if name)
             plane = 0.0 if field.shape[-1] == 2 else None
-            points.append(Points(field.name, names, plane))
+            points.append(Points(field.name, names, plane, field.present))
             pairs += [(rows[:, row], middles[name]) for row, name in enumerate(names)]
     if not points:
         raise DataError(
@@ -112,7 +112,7 @@ def layout_from_dict(values: Mapping[str, Any]) -> Layout:
         ),
         tuple(values["instances"]),
         tuple(
-            Points(each["field"], tuple(each["instances"]), each["plane"])
+            Points(each["field"], tuple(each["instances"]), each["plane"], each.get("present", ""))
             for each in values["points"]
         ),
         tuple(Local(**each) for each in values["locals"]),
