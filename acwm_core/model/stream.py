@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 
 from acwm_core.errors import RecipeError, ShapeError
-from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.codec import Codec
+from acwm_core.model.conditioner import Conditioner, Conditioning
+from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Latent, Video, float32_by_default
 
-if TYPE_CHECKING:
-    from acwm_core.model.world_model import WorldModel
+
+class Streamed(Protocol):
+    """What a stream asks of a `WorldModel`, whose attributes these are."""
+
+    @property
+    def codec(self) -> Codec: ...  # noqa: D102
+    @property
+    def model(self) -> DynamicsModel: ...  # noqa: D102
+    @property
+    def conditioner(self) -> Conditioner: ...  # noqa: D102
+    @property
+    def objective(self) -> Objective[Any]: ...  # noqa: D102
+    def normalise(self, actions: Actions) -> Actions: ...  # noqa: D102
+    def checked(self, actions: Actions) -> Actions: ...  # noqa: D102
 
 
 def continued(actions: Actions, rows: int) -> Actions:
@@ -41,7 +56,7 @@ class Stream:
 
     def __init__(
         self,
-        world: WorldModel,
+        world: Streamed,
         given: Video,
         actions: Actions,
         *,
