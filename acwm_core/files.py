@@ -8,6 +8,7 @@ import functools
 import glob
 import json
 import os
+import re
 import shutil
 import socket
 import stat
@@ -42,6 +43,11 @@ OF_THE_DISK = (
 
 FULL = 2**20
 """Free bytes below which a disk is full, where a library fails to write without an error number."""
+
+MOST_VALUES = 1_000_000
+"""Most values that a YAML file may hold, with those that its aliases repeat."""
+
+_NAME = re.compile(r"\w[\w .+-]{0,199}")
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
 """Errors of a file system without locks, as on some clusters."""
@@ -309,30 +315,73 @@ def _holder(lock: Path) -> str:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The file `name` of `folder`, for names that come from a file.
+    """The file `name` of `folder`, for names that come from a file; it need not exist.
 
     Raises:
         DataError: the name, or a link on its way, leads out of the folder.
     """
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        is_inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # links in a circle, or a null byte
+        raise DataError(f"{path!s:.200} is no path ({error!s:.200})") from None
+    if not is_inside:
         raise DataError(f"{path} leads out of {folder}, which is not allowed: put the file there")
     return path
 
 
+def regular_file(folder: Path, name: str) -> Path:
+    """The file `name` of `folder`, which somebody else filled.
+
+    Raises:
+        DataError: it is missing, leads out of the folder, or is no regular file: a folder, a
+            device, or a pipe, which would be waited for without end.
+    """
+    path = inside(folder, name)
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise DataError(f"{path} cannot be read ({why})") from error
+    if not stat.S_ISREG(mode):
+        raise DataError(f"{path} is no regular file: put the file itself there")
+    return path
+
+
+def plain_name(name: str, what: str) -> str:
+    """Return `name` if it may be part of a path: one that comes in a file decides no folder.
+
+    Args:
+        what: what bears the name, for the message, e.g. ``"an environment"``.
+
+    Raises:
+        ValueError: it has other characters than letters, digits, ``_ . + -`` and spaces, does not
+            begin with a letter, digit or ``_``, or is longer than 200 characters.
+    """
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{name[:80]!r} cannot be the name of {what}: use letters, digits, _, . and -"
+        )
+    return name
+
+
 def check_inside(folder: Path, *own: str) -> None:
     """Refuse links that lead out of `folder` among the files that acwm reads or writes there.
+
+    So are pipes and devices, which would be waited for without end.
 
     Args:
         folder: a dataset or a run.
         *own: patterns of the files, e.g. ``"*/*.tar"``. Other files are none of acwm's business.
 
     Raises:
-        DataError: there is such a link; names it.
+        DataError: there is such a file; names it.
     """
     for pattern in own:
         for path in folder.glob(pattern):
-            inside(folder, str(path.relative_to(folder)))
+            name = str(path.relative_to(folder))
+            if inside(folder, name).exists() and not path.is_dir():
+                regular_file(folder, name)
 
 
 def parse_json(data: bytes | str) -> Any:
@@ -341,9 +390,54 @@ def parse_json(data: bytes | str) -> Any:
     Raises:
         ValueError: it is something else.
     """
-    found = json.loads(data)
-    _finite_json(found)
+    try:
+        found = json.loads(data)
+        _finite_json(found)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
     return found
+
+
+def parse_yaml(text: str, loader: Any = None) -> Any:
+    """Parse YAML of plain values.
+
+    Args:
+        loader: a loader of PyYAML that executes nothing; `yaml.SafeLoader` by default.
+
+    Raises:
+        ValueError: it is nested too deeply, refers to itself, or its aliases stand for more than
+            `MOST_VALUES` values, which a few lines can do.
+        yaml.YAMLError: it is no YAML.
+    """
+    import yaml
+
+    reader: Any = cast(Any, loader or yaml.SafeLoader)(text)
+    try:
+        node = reader.get_single_node()
+        if node is None:
+            return None
+        if _values(node, {}) > MOST_VALUES:
+            raise ValueError(f"its aliases stand for more than {MOST_VALUES:,} values")
+        return reader.construct_document(node)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    finally:
+        reader.dispose()
+
+
+def _values(node: Any, known: dict[int, int]) -> int:
+    """The number of values below a node of YAML, each counted as often as aliases repeat it."""
+    if isinstance(node.value, str):
+        return 1
+    if (count := known.get(id(node))) is not None:
+        if not count:
+            raise ValueError("it refers to itself")
+        return count
+    known[id(node)] = 0
+    items: list[Any] = node.value
+    pairs: list[tuple[Any, ...]] = [item if isinstance(item, tuple) else (item,) for item in items]
+    known[id(node)] = 1 + sum(_values(part, known) for pair in pairs for part in pair)
+    return known[id(node)]
 
 
 def _finite_json(values: object) -> str:

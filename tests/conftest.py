@@ -89,6 +89,20 @@ def references_stay():
     assert {path: path.stat().st_size for path in folder.rglob("*")} == before
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """What evaluations of tests keep is not left in the user's cache."""
+    from acwm_core.data.remote import cache_folder
+
+    usual, own = cache_folder(), tmp_path_factory.mktemp("cache")
+    for path in usual.glob("*"):  # such as what was downloaded for pages of play
+        if path.name != "references":
+            (own / path.name).symlink_to(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ACWM_CACHE", str(own))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     """What a test draws without a seed is the same whichever tests ran before it."""

@@ -42,6 +42,7 @@ def print_table(
 
     def table(columns: Sequence[int], title: str | None) -> Table:
         made = plain_table(title, "", [numbers[column] for column in columns])
+        made.columns[0].no_wrap, made.columns[0].overflow = False, "fold"  # a name is never cut
         for name, cells in rows:
             made.add_row(name, *(cells[column] for column in columns))
         return made

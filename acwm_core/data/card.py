@@ -18,7 +18,7 @@ import yaml
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
-from acwm_core.files import check_inside, typed, written_whole
+from acwm_core.files import check_inside, parse_yaml, typed, written_whole
 from acwm_core.recipe.recipe import flat_items
 
 CARD, MANIFEST = "card.yaml", "manifest.jsonl"
@@ -83,7 +83,8 @@ class DatasetCard:
             return f"{self.source['command']} --out {shlex.quote(str(out))}"
         if self.source:
             return "the program that wrote it"
-        factors = "".join(f" factors.{name}={value}" for name, value in self.factors.items())
+        words = (f"factors.{name}={_text(value)}" for name, value in self.factors.items())
+        factors = "".join(f" {shlex.quote(word)}" for word in words)
         exploration = f" --exploration {self.exploration}" if self.exploration else ""
         exploration += f" --shift {self.shift}" if self.shift else ""
         counts = ",".join(str(self.splits.get(each, 0)) for each in SPLITS)
@@ -92,6 +93,34 @@ class DatasetCard:
         return (
             f"acwm generate {self.environment.name}{factors} {which} --size {height}x{width} "
             f"--seed {self.seed}{exploration} --out {shlex.quote(str(out))}"
+        )
+
+    def of_tests(self, dataset: Mapping[str, Any]) -> DatasetCard:
+        """The card of the simulated test data that an evaluation names.
+
+        Args:
+            dataset: the facts of these data in the evaluation's provenance.
+        """
+        splits = {split: count for split, count in dataset["episodes"].items() if split != "train"}
+        size: Any = tuple(dataset["frame_size"])
+        return replace(
+            self,
+            environment=replace(self.environment, frame_size=size),
+            splits=cast(Mapping[Split, int], splits),
+            seed=dataset["seed"],
+            options=dataset["options"],
+            factors=dataset["factors"],
+            exploration=0.0,
+            shift=0.0,
+        )
+
+    def holds(self, other: DatasetCard) -> bool:
+        """Whether these data, simulated, hold the test episodes of `other`."""
+        same = ("seed", "options", "factors")
+        return (
+            self.environment.frame_size == other.environment.frame_size
+            and all(getattr(self, name) == getattr(other, name) for name in same)
+            and all(self.splits.get(split) == count for split, count in other.splits.items())
         )
 
     @property
@@ -151,7 +180,7 @@ class DatasetCard:
                 f"`acwm generate ENVIRONMENT --out {file.parent}`"
             )
         try:
-            values = cast(dict[str, Any], yaml.safe_load(file.read_text(encoding="utf-8")))
+            values = cast(dict[str, Any], parse_yaml(file.read_text(encoding="utf-8")))
             version = values["format"]
             if version == FORMAT:
                 return cls.from_dict(values)
@@ -209,6 +238,11 @@ def package_versions(packages: Iterable[str] = ()) -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             versions[package] = "unknown"
     return versions
+
+
+def _text(value: FactorSetting) -> str:
+    """A factor's setting as it is typed."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _recipe(card: DatasetCard, begin: str = "") -> dict[str, Any]:

@@ -19,6 +19,7 @@ from acwm_core.env.state_field import check_scene
 from acwm_core.env.states import transform
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import ShapeError, expect
+from acwm_core.files import plain_name
 
 ActionKind = Literal["absolute", "delta", "velocity", "torque"]
 """What an action commands: a position, a change of position, a speed, or a force or torque."""
@@ -209,7 +210,15 @@ class EnvironmentCard:
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> EnvironmentCard:
-        """The inverse of `to_dict`, also after a round trip through JSON or YAML."""
+        """The inverse of `to_dict`, also after a round trip through JSON or YAML.
+
+        Raises:
+            ValueError: its name or that of a factor, which become names of folders and files, is
+                no plain word.
+        """
+        plain_name(fields["name"], "an environment")
+        for factor in fields["factors"]:
+            plain_name(factor["name"], "a factor")
         values = {name: _tuples(value) for name, value in fields.items()}
         values["action"] = ActionSpec(**_fields(fields["action"]))
         values["factors"] = tuple(Factor(**_fields(f)) for f in fields["factors"])

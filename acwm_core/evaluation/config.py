@@ -48,8 +48,9 @@ class EvaluationConfig:
             none is predicted once and scored by the same rules. The test with other actions, the
             curve of sampling steps and videos take one draw.
         steps_sweep: numbers of sampling steps at which a few clips are also predicted, for the
-            curve of scores against steps. Empty for no curve; models without sampling steps have
-            none. Metrics that read states from video are left out, unless one ranks the clips.
+            curve of scores against steps, e.g. ``(1, 2, 5, 10, 20, 50)``, which takes several times
+            as long as the evaluation. Empty for no curve; models without sampling steps have none.
+            Metrics that read states from video are left out, unless one ranks the clips.
         sweep_episodes: number of clips per split for this curve, the first ones.
         batch_size: clips predicted at once; affects speed and memory, not the results.
         seed: seed of the sampling noise, and of the other episodes drawn for ``shuffled``.
@@ -82,7 +83,7 @@ class EvaluationConfig:
     cuts: PositiveInt | None = None
     steps: PositiveInt | None = None
     samples: PositiveInt = 1
-    steps_sweep: tuple[PositiveInt, ...] = (1, 2, 4, 5, 10, 20, 50)
+    steps_sweep: tuple[PositiveInt, ...] = ()
     sweep_episodes: Several = 4
     batch_size: PositiveInt = 8
     seed: NonNegativeInt = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import time
 import warnings
@@ -30,7 +31,7 @@ from acwm_core.evaluation.predict import Evaluator, VideoModel
 from acwm_core.evaluation.protocol import Published, published_for
 from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.references import scores_with_references
-from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary
+from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary, unfinished
 from acwm_core.evaluation.score import build_metrics, estimator_for, split_available
 from acwm_core.evaluation.storage import (
     EPISODES,
@@ -48,6 +49,9 @@ from acwm_core.model.shapes import float32_by_default
 from acwm_core.recipe import Recipe, compose
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, run_to_write
+
+FEW_TESTS = 64
+"""Test episodes of a split that are advised for data without any."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +105,9 @@ def evaluate_run(
     parts = {"env": evaluator.card.name, **{name: getattr(recipe, name).name for name in named}}
     published = published_for({**parts, "fraction": recipe.data["fraction"]})
     facts = run_facts(folder, recipe, evaluator)
-    planned, done = recipe.trainer.get("max_steps") or 0, facts["training_steps"]
-    if done < planned:
-        warnings.warn(
-            f"{folder.path} is trained for {done:,} of its {planned:,} steps: these scores are of "
-            "an unfinished model",
-            AcwmWarning,
-            stacklevel=2,
-        )
+    if phrase := unfinished(facts):
+        said = f"{folder.path} is {phrase}: these scores are of an unfinished model"
+        warnings.warn(said, AcwmWarning, stacklevel=2)
     entrant = Entrant(parts, facts, published)
     home = results_folder(folder, out)
     how = {"overwrite": overwrite, "progress": progress}
@@ -249,10 +248,23 @@ def dataset_of(run: RunFolder, recipe: Recipe) -> str:
     path: str = recipe.data["path"]
     if ":" in path or (Path(path) / CARD).is_file():
         return path
-    card = DatasetCard.read(run.card)
-    tests = replace(card, splits={**card.splits, "train": 0})
-    make = "" if card.source else f"make its test episodes with `{tests.command(path)}`, or "
+    tests = _test_card(run, DatasetCard.read(run.card))
+    make = "" if tests.source else f"make its test episodes with `{tests.command(path)}`, or "
     raise DataError(f"there is no dataset in {path}: {make}name one with --data")
+
+
+def _test_card(run: RunFolder, card: DatasetCard) -> DatasetCard:
+    """The card of a run's test data: those of its last evaluation, or those of its own data.
+
+    Training data may lack test episodes; then there are `FEW_TESTS` of each split.
+    """
+    if not card.source:
+        with contextlib.suppress(DataError, OSError, LookupError, TypeError):
+            last = Summary.load(run.path / FOLDER / SUMMARY).provenance["dataset"]
+            if last["seed"] is not None and not last["source"]:
+                return card.of_tests(last)
+    tests = {split: count for split, count in card.splits.items() if split != "train"}
+    return replace(card, splits=tests or {"ind_test": FEW_TESTS, "ood_test": FEW_TESTS})
 
 
 def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:

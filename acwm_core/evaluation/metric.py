@@ -107,12 +107,20 @@ class Prediction:
         )
 
     def check_shapes(self) -> None:
-        """Raise a `ShapeError` unless video and target have the same shape, with some frames."""
+        """Raise a `ShapeError` unless video and target have the same shape, with some frames.
+
+        So must the true masks and states, frame by frame.
+        """
         video, target = list(self.video.shape), list(self.target.shape)
         if video != target or len(target) != 4 or not target[0]:
             raise ShapeError(
                 f"metrics compare two clips [T, 3, H, W] of one shape, not {video} with {target}"
             )
+        for name, values in {"masks": self.masks, **self.states}.items():
+            if len(values) != target[0]:
+                raise ShapeError(
+                    f"a clip of {target[0]} frames has {name} of {len(values)}: cut both alike"
+                )
 
     @functools.cached_property
     def observed(self) -> Observation:
@@ -121,7 +129,9 @@ class Prediction:
         Raises:
             PluginError: there is no estimator; a metric that needs one must say so in
                 `unavailable`.
+            ShapeError: the prediction is longer or shorter than the truth.
         """
+        self.check_shapes()
         if self.estimator is None:
             raise PluginError(f"nothing reads states from video of {self.card.name}")
         return self.estimator.read(self.video)
@@ -266,7 +276,12 @@ class Metric(ABC):
         return float((~np.isnan(curve)).mean())
 
     def curve(self, prediction: Prediction) -> NDArray[np.float64]:
-        """Call `per_frame`; `PluginError` unless the result has one number per frame."""
+        """Call `per_frame`; `PluginError` unless the result has one number per frame.
+
+        Raises:
+            ShapeError: prediction and truth have other lengths or sizes.
+        """
+        prediction.check_shapes()
         scores = np.asarray(self.per_frame(prediction), np.float64)
         check_shape(self, "per_frame", scores, len(prediction.target))
         return scores
@@ -281,7 +296,9 @@ class Metric(ABC):
 
         Raises:
             PluginError: the weight is negative or not finite.
+            ShapeError: as in `curve`.
         """
+        prediction.check_shapes()
         if not prediction.is_finite:
             return self.worst, 1.0
         if type(self).value is Metric.value:

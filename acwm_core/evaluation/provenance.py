@@ -31,6 +31,7 @@ def run_facts(folder: RunFolder, recipe: Recipe, evaluator: Evaluator) -> dict[s
         "recipe": recipe.to_yaml(),
         "weights_sha256": file_sha256(folder.weights),
         "training_steps": facts["step"],
+        "planned_steps": recipe.trainer.get("max_steps"),
         "imported": facts.get("imported"),
         "parameters": sum(parameter.numel() for parameter in trained),
         "sampling_steps": config.steps or world_model.steps or 1,

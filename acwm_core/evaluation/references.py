@@ -1,4 +1,6 @@
-"""A cache of the reference rows: they are the same for all models with the same codec."""
+"""A cache of the reference rows: they are the same for all models with the same codec.
+
+It lies in the user's own cache and never beside the data, which may come from somebody else."""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from typing import Any
 
 import acwm_core
 from acwm_core.data.dataset import EpisodeDataset
-from acwm_core.data.shards import file_sha256
+from acwm_core.data.remote import cache_folder, origin
+from acwm_core.data.shards import file_sha256, shard_name
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import DRAWN, Clip, Predictor
 from acwm_core.evaluation.predict import Evaluator
@@ -34,7 +37,7 @@ def scores_with_references(
     """What `Evaluator.scores` returns, with the rows of `KEPT` read from the cache.
 
     If they are not cached yet, they are computed and cached for the next evaluation, provided that
-    the data folder is writable.
+    the user's cache is writable.
     """
     file = references_file(evaluator, clips, episodes)
     found: list[Score] = []
@@ -44,8 +47,8 @@ def scores_with_references(
     made = evaluator.scores(clips, episodes, asked)
     evaluator.advance(len(found))
     if file and not found:
-        with contextlib.suppress(OSError, DataError):  # e.g. a read-only dataset
-            file.parent.mkdir(exist_ok=True)
+        with contextlib.suppress(OSError, DataError):  # e.g. a read-only cache
+            file.parent.mkdir(parents=True, exist_ok=True)
             write_scores(file, [score for score in made if score.kind in KEPT])
     rows = {(row.episode, row.start, row.kind): row for row in [*found, *made]}
     kinds = dict.fromkeys(("model", *DRAWN, *evaluator.predictors))
@@ -58,8 +61,9 @@ def references_file(
 ) -> Path | None:
     """The cache file for the rows of these clips; None if the code behind them cannot be hashed.
 
-    Its name contains a hash of everything they depend on, so it is never out of date. The folder
-    may be deleted.
+    Its name contains a hash of everything they depend on, so it is never out of date. That includes
+    where the data lie and when they were written, because a checksum that comes with them is a
+    claim. The folder may be deleted.
     """
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
     components = [codec, *evaluator.metrics.values()]
@@ -69,7 +73,7 @@ def references_file(
     if None in hashes.values():
         return None
     facts: dict[str, Any] = {
-        "data": episodes.checksum,
+        "data": [episodes.checksum, *_files(episodes)],
         "clips": [(c.episode, c.start, c.frames, c.noise_floor, c.given) for c in clips],
         "codec": codec.fingerprint(),
         "device": evaluator.device.type,
@@ -80,7 +84,22 @@ def references_file(
         "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
     }
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-    return episodes.path / REFERENCES / f"{episodes.split}-{key[:16]}.parquet"
+    return cached(f"{episodes.split}-{key[:16]}.parquet")
+
+
+def cached(name: str) -> Path:
+    """The place of a file in the user's cache of references."""
+    return cache_folder() / REFERENCES / name
+
+
+def _files(episodes: EpisodeDataset) -> list[Any]:
+    """Where the shards lie, with sizes and dates; those behind a URL are checked when fetched."""
+    folder = (episodes.path / episodes.split).resolve()
+    if origin(episodes.path) is not None:
+        return [str(folder)]
+    shards = [folder / shard_name(number) for number in range(len(episodes.shards))]
+    states = [path.stat() if path.exists() else None for path in shards]
+    return [str(folder), *(each and (each.st_size, each.st_mtime_ns) for each in states)]
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -321,6 +322,11 @@ class Summary:
         return "predictions_sha256" in self.provenance
 
     @property
+    def unfinished(self) -> str:
+        """A phrase if the model was evaluated before its training had ended; else empty."""
+        return unfinished(self.provenance)
+
+    @property
     def predictor(self) -> str:
         """SHA-256 of what predicted: weights, or predictions that were handed in."""
         of = "predictions" if self.handed_in else "weights"
@@ -360,6 +366,14 @@ class Summary:
         if not scores or not all(found.headline in row for row in (found.metrics, *scores)):
             raise DataError(f"{path} is not a whole summary: it lacks the model's {found.headline}")
         return found
+
+
+def unfinished(facts: Mapping[str, Any]) -> str:
+    """How far a model is trained, by its facts in `Summary.provenance`, if that is not all."""
+    done, planned = (facts.get(f"{name}_steps") for name in ("training", "planned"))
+    if not planned or done is None or done >= planned:
+        return ""
+    return f"trained for {done:,} of {planned:,} steps"
 
 
 def write_json(path: Path, result: object) -> None:

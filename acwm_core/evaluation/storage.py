@@ -40,6 +40,9 @@ CURVE, WEIGHT, FEATURES, SHARE = "_per_frame", "_weight", "_features", "_share"
 WITHOUT_EFFECT = ("batch_size", "device")
 """Settings that change results only by rounding."""
 
+OF_CURVES = ("steps_sweep", "sweep_episodes")
+"""Settings of the curve of sampling steps, without effect on a result that has none."""
+
 OF_SWEEPS = ("severity_episodes",)
 """Settings that an evaluation without ``--sweep`` does not use."""
 
@@ -122,9 +125,12 @@ def refuse_other_result(
         DataError: settings or data differ; the message says how.
     """
     try:
-        facts = parse_json(file.read_bytes())["provenance"]
+        result = parse_json(file.read_bytes())
+        facts = result["provenance"]
         there = current_settings(facts["evaluation"])
         checksums = dict[str, str](facts["dataset"]["checksums"])
+        if not any(split.get("steps") for split in result.get("splits", {}).values()):
+            free = (*free, *OF_CURVES)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return
     now = {

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from acwm_core.errors import RecipeError
+from acwm_core.files import parse_yaml
 
 
 def parse(text: str, origin: str) -> Any:
@@ -21,7 +22,7 @@ def parse(text: str, origin: str) -> Any:
         RecipeError: it is not valid YAML; says where and why.
     """
     try:
-        return yaml.load(text, _Loader)
+        return parse_yaml(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""

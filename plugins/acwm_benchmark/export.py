@@ -23,7 +23,7 @@ from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.clips import Clip, plan_clips, read_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import open_splits
-from acwm_core.files import made_whole, writing
+from acwm_core.files import inside, made_whole, writing
 from acwm_core.model.world_model import CLIP_FRAMES
 from acwm_core.plugins import catalog
 from acwm_core.recipe.check import check_section
@@ -40,7 +40,7 @@ USUAL_EPISODES = 64
 ALL = 0
 """Stands for all episodes."""
 
-OF_NETWORKS: dict[str, Any] = {"steps_sweep": (), "device": "cpu"}
+OF_NETWORKS: dict[str, Any] = {"device": "cpu"}
 """Settings of which predictions that were made elsewhere know nothing."""
 
 
@@ -149,7 +149,7 @@ def _export_world(
     given = config.context_frames or 1
     clips = {s: plan_clips(s, each.lengths, config, given) for s, each in datasets.items()}
     frames = given + CLIP_FRAMES - 1
-    (folder / name).mkdir()
+    inside(folder, name).mkdir()
     tasks = [_write(folder, name, each) for each in _of_clips(name, clips, datasets)]
     branches = [
         _write(folder, name, each) for each in _of_branches(name, clips, datasets, config, frames)

@@ -1,23 +1,25 @@
 """What a lossy video codec costs, measured on the truth.
 
-The encoder of a participant is not known, only its file. So the quality is sought at which the
-first prediction, encoded again, is as large as that file; then the truth is encoded so.
+The encoder of a participant is not known, only its files. So for each the quality is sought at
+which it, encoded again, is as large as the file; the truth is encoded at the median of these.
 """
 
 from __future__ import annotations
 
 import io
+import statistics
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from acwm_benchmark.videos import Coding, read_video
+from acwm_benchmark.videos import Coding, Wanted, read_video
 from acwm_core.data.pictures import to_pixels
 from acwm_core.data.video import Encoding, encode_frames
 from acwm_core.errors import DataError
@@ -67,6 +69,13 @@ ENCODERS = {
 """How to encode as a file is coded, by FFmpeg's name of the codec."""
 
 
+class Sample(NamedTuple):
+    """A file that was handed in: its size in bytes, and its frames `[T, H, W, 3]` in [0, 1]."""
+
+    size: int
+    video: NDArray[np.float32]
+
+
 class Lossless:
     """Stands for files that lose nothing."""
 
@@ -84,24 +93,24 @@ class LossyVideo:
 
     Args:
         coding: how the files are coded.
-        sample: one of them.
+        samples: all of them.
         fps: their frames per second.
 
     Raises:
         DataError: acwm cannot encode so.
     """
 
-    def __init__(self, coding: Coding, sample: Path, fps: float) -> None:
+    def __init__(self, coding: Coding, samples: Iterable[Sample], fps: float) -> None:
         self.coding, self.fps = coding, fps
         name = coding.codec.removeprefix("lib").partition("_")[0]
         name = {"dav1d": "av1", "vpx-vp9": "vp9", "aom-av1": "av1"}.get(name, name)
         if name != "gif" and name not in ENCODERS:
             raise DataError(
-                f"{sample} is coded by {coding}, whose loss cannot be measured: submit H.264, or "
-                "PNG or NPZ, which lose nothing"
+                f"predictions are coded by {coding}, whose loss cannot be measured: submit H.264, "
+                "or PNG or NPZ, which lose nothing"
             )
         self.encoder = ENCODERS.get(name)
-        self.quality = self._found(sample, self.encoder) if self.encoder else 0
+        self.quality = self._median_quality(samples, self.encoder) if self.encoder else 0
 
     def fingerprint(self) -> str:
         """Codec, pixels and quality, e.g. ``h264 yuv420p 23``."""
@@ -116,7 +125,8 @@ class LossyVideo:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"clip{suffix}")
             path.write_bytes(self._encoded(frames, self.quality))
-            return np.ascontiguousarray(read_video(path, self.fps).transpose(0, 3, 1, 2))
+            wanted = Wanted(*frames.shape[:3])
+            return np.ascontiguousarray(read_video(path, self.fps, wanted).transpose(0, 3, 1, 2))
 
     def _encoded(self, frames: NDArray[np.uint8], quality: int) -> bytes:
         if self.encoder is None:
@@ -127,17 +137,40 @@ class LossyVideo:
         encoding = Encoding("rgb24", stored, name, self.encoder.options(quality))
         return encode_frames(frames, frames.shape[1:3], encoding, self.fps, KEYFRAMES)
 
-    def _found(self, sample: Path, encoder: Encoder) -> int:
-        """The lowest quality at which the sample is still as large as its file."""
-        frames = (read_video(sample, self.fps) * 255).round().astype(np.uint8)
-        size, best, worst = sample.stat().st_size, encoder.best, encoder.worst
-        while best < worst:
-            middle = (best + worst + 1) // 2
-            if len(self._encoded(frames, middle)) >= size:
-                best = middle
-            else:
-                worst = middle - 1
-        return best
+    def _median_quality(self, samples: Iterable[Sample], encoder: Encoder) -> int:
+        if encoder.best == encoder.worst:
+            return encoder.best
+        found: list[int] = []
+        for sample in samples:
+            near = found[-1] if found else (encoder.best + encoder.worst) // 2
+            found.append(self._quality_of(sample, encoder, near))
+        return statistics.median_low(found)
+
+    def _quality_of(self, sample: Sample, encoder: Encoder, near: int) -> int:
+        """The lowest quality at which the sample is still as large as its file.
+
+        The search widens from `near`, because files of one encoder are alike.
+        """
+        frames = (sample.video * 255).round().astype(np.uint8)
+
+        def is_large(quality: int) -> bool:
+            return len(self._encoded(frames, quality)) >= sample.size
+
+        low, high, step = encoder.best, encoder.worst + 1, 1
+        if is_large(near):
+            low = near
+            while low + step < high and is_large(low + step):
+                low, step = low + step, 2 * step
+            high = min(high, low + step)
+        else:
+            high = near
+            while high - step > low and not is_large(high - step):
+                high, step = high - step, 2 * step
+            low = max(low, high - step)
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if is_large(middle) else (low, middle)
+        return low
 
 
 def as_gif(frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], fps: float) -> bytes:

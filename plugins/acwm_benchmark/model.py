@@ -37,8 +37,7 @@ class HandedIn:
         coding = predictions.coding
         self.codec = Lossless()
         if coding is not None:
-            sample = next(iter(predictions.files.values()))[0]
-            self.codec = LossyVideo(coding, sample, world.fps)
+            self.codec = LossyVideo(coding, predictions.samples(), world.fps)
         self.samples = predictions.draws > 1
         self._predictions = predictions
         self._span = np.subtract(world.actions["high"], world.actions["low"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_benchmark.lossy import Sample
 from acwm_benchmark.tasks import Task, World
-from acwm_benchmark.videos import CONTAINERS, NPZ, Coding, coding_of, read_whole
+from acwm_benchmark.videos import CONTAINERS, NPZ, Coding, coding_of, pictures_in, read_whole
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, suggest
+from acwm_core.files import inside, regular_file
 
 TOLD = 5
 """How many faults are told in one error."""
@@ -51,12 +53,18 @@ class Predictions:
                 )
         return found
 
+    def samples(self) -> Iterator[Sample]:
+        """All videos with the sizes of their files."""
+        for task, paths in self.files.items():
+            for draw, path in enumerate(paths):
+                yield Sample(path.stat().st_size, self.video(task, draw))
+
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of all files and their names."""
         digest = hashlib.sha256()
         for path in sorted(path for paths in self.files.values() for path in paths):
-            for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            for file in sorted(pictures_in(path)) if path.is_dir() else [path]:
                 digest.update(f"{path.name}/{file.name}\0{file_sha256(file)}".encode())
         return digest.hexdigest()
 
@@ -90,7 +98,7 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
     Raises:
         DataError: one is missing or is there twice, one is of no task, or numbers of draws differ.
     """
-    place, wanted = folder / world.name, {task.id: task for task in tasks}
+    place, wanted = inside(folder, world.name), {task.id: task for task in tasks}
     if not place.is_dir():
         raise DataError(
             f"{folder} holds no predictions of {world.name} (no folder {place}): add them, or name "
@@ -102,7 +110,11 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
         if path.name.startswith("."):
             continue
         name, draw = _named(path, world.name, wanted)
-        if name not in wanted:
+        if no_file := _no_file(folder, path):
+            faults.append(no_file)
+            if name in wanted:
+                found.setdefault(name, {})[draw] = path  # it is not missing
+        elif name not in wanted:
             faults.append(f"{path} is of no task{suggest(name, wanted)}")
         elif draw in found.setdefault(name, {}):
             faults.append(f"{name}: {found[name][draw].name} and {path.name} are both of it")
@@ -115,10 +127,24 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
     return Predictions(folder, world, wanted, files)
 
 
+def _no_file(folder: Path, path: Path) -> str:
+    """Why a prediction is no file of its own, nor a folder of such; empty if it is.
+
+    What a link leads to may be another's prediction, and a pipe would be waited for without end.
+    """
+    try:
+        place = inside(folder, str(path.relative_to(folder)))
+        for each in pictures_in(path) if place.is_dir() else [path]:
+            regular_file(folder, str(each.relative_to(folder)))
+    except (DataError, OSError) as error:
+        return str(error)
+    return ""
+
+
 def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:
     """The id of a prediction's file or folder, and the number of its draw."""
     name = path.name
-    if path.is_file() and path.suffix.lower() in (*CONTAINERS, NPZ):
+    if not path.is_dir() and path.suffix.lower() in (*CONTAINERS, NPZ):
         name = path.stem
     task = f"{world}/{name}"
     draw = _DRAW.fullmatch(task)

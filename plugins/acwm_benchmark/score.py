@@ -17,7 +17,7 @@ from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.evaluate import Entrant, evaluate_clips, evaluator_of
 from acwm_core.evaluation.protocol import published_for
 from acwm_core.evaluation.results import FOLDER, Summary
-from acwm_core.files import writing
+from acwm_core.files import inside, writing
 from acwm_core.recipe.check import check_section
 from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
 from acwm_interventions.evaluate import STUDIES
@@ -71,7 +71,7 @@ def score_predictions(
     summaries: dict[str, Summary] = {}
     for world, each in zip(chosen, found, strict=True):
         datasets = truth_of(world, place, workers, progress)
-        results = home / world.name / FOLDER
+        results = inside(home, world.name) / FOLDER
         with writing(results):
             results.mkdir(parents=True, exist_ok=True)
         summaries[world.name] = _score(given, each, entry, datasets, results, overwrite, progress)

@@ -8,18 +8,20 @@ TASKS/WORLD/ID.npz           the actions
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_benchmark.arrays import read_array
 from acwm_core.data.shards import file_sha256
+from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, suggest
-from acwm_core.files import inside, parse_json, read_json, typed
+from acwm_core.files import parse_json, plain_name, read_json, regular_file, typed
 
 BENCHMARK, INDEX, SUMS, README = "benchmark.json", "index.jsonl", "SHA256SUMS", "README.md"
 
@@ -53,6 +55,11 @@ class World:
     branch_frames: int
     source: dict[str, Any] = field(default_factory=dict[str, Any])
     seed: int | None = None
+
+    def __post_init__(self) -> None:
+        plain_name(self.name, "a world")
+        if not set(self.checksums) <= set(SPLITS):
+            raise ValueError(f"{', '.join(self.checksums)} are no splits")
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,11 @@ class Benchmark:
     worlds: dict[str, World]
     version: int = 1
 
+    def __post_init__(self) -> None:
+        for name, world in self.worlds.items():
+            if world.name != name:
+                raise ValueError(f"the world {world.name!r} is called {name!r}")
+
 
 class Tasks:
     """A folder of tasks that `acwm benchmark export` wrote.
@@ -98,17 +110,29 @@ class Tasks:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        try:
-            self.benchmark = read_json(self.folder / BENCHMARK, Benchmark, "the benchmark")
-            lines = (self.folder / INDEX).read_text(encoding="utf-8").splitlines()
-            self.all = [typed(parse_json(line), Task) for line in lines]
-        except OSError:
+        if not all((self.folder / name).exists() for name in (BENCHMARK, INDEX)):
             raise DataError(
                 f"{self.folder} holds no tasks ({BENCHMARK}, {INDEX}): make them with "
                 "`acwm benchmark export`, or take the organiser's folder"
-            ) from None
+            )
+        benchmark = regular_file(self.folder, BENCHMARK)
+        self.benchmark = read_json(benchmark, Benchmark, "the benchmark")
+        index = regular_file(self.folder, INDEX)
+        try:
+            lines = index.read_text(encoding="utf-8").splitlines()
+            self.all = [typed(parse_json(line), Task) for line in lines]
+            for task in self.all:
+                self._check(task)
         except ValueError as error:
-            raise DataError(f"{self.folder / INDEX} is damaged ({error})") from error
+            raise DataError(f"{index} is damaged ({error})") from error
+
+    def _check(self, task: Task) -> None:
+        if task.world not in self.benchmark.worlds:
+            raise ValueError(f"{BENCHMARK} has no world {task.world!r}")
+        world, _, name = task.id.partition("/")
+        if world != task.world:
+            raise ValueError(f"the task {task.id!r} is of the world {task.world!r}")
+        plain_name(name, "a task")
 
     @property
     def checksum(self) -> str:
@@ -134,12 +158,17 @@ class Tasks:
 
     def actions(self, task: Task) -> NDArray[np.float32]:
         """The actions of a task, `[T, A]`."""
-        path = inside(self.folder, task.actions)
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                return arrays["actions"]
-        except (OSError, ValueError, LookupError, BadZipFile) as error:
-            raise DataError(f"{path} cannot be read ({error}): export the tasks again") from error
+        wanted = task.frames, len(self.benchmark.worlds[task.world].actions["names"])
+
+        def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+            if shape != wanted or dtype != np.float32:
+                raise DataError(
+                    f"{task.actions} holds {dtype} {[*shape]}, not float32 {[*wanted]}: export the "
+                    "tasks again"
+                )
+
+        path = regular_file(self.folder, task.actions)
+        return read_array(path, "actions", check, math.prod(wanted) * 4)
 
 
 def write_index(folder: Path, worlds: Mapping[str, World], tasks: Iterable[Task]) -> None:

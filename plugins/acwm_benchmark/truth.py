@@ -12,6 +12,7 @@ from acwm_core.data.generate import generate
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError
 from acwm_core.evaluation.evaluate import open_splits
+from acwm_core.files import inside
 
 TESTS: tuple[Split, ...] = tuple(split for split in SPLITS if split != "train")
 
@@ -53,8 +54,8 @@ def truth_of(
             raise DataError(
                 f"{path} holds other episodes of {split} than the tasks are of "
                 f"({each.checksum[:8]}, not {world.checksums[split][:8]}): give the organiser's "
-                "data with --data, or simulate it on the same kind of machine with the same "
-                "versions"
+                "data with --data, or simulate it on the same kind of processor with the "
+                "same versions"
             )
     return datasets
 
@@ -71,10 +72,9 @@ def _simulated(world: World, folder: Path, workers: int | None, progress: bool) 
             f"{folder} holds no {world.name}, and the seed of its tasks is secret: only the "
             "organiser can score them, who names the data with --data"
         )
-    simulate(
-        world.name, folder / world.name, world.episodes, world.size, world.seed, workers, progress
-    )
-    return folder / world.name
+    place = inside(folder, world.name)
+    simulate(world.name, place, world.episodes, world.size, world.seed, workers, progress)
+    return place
 
 
 def simulate(

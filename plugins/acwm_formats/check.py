@@ -42,6 +42,10 @@ class CheckedItem:
         return f"ok    {self.what}" + (f" ({self.note})" if self.note else "")
 
 
+ROUNDING = 0.01
+"""Mean difference of pixels, of 255 levels, that is rounding, and share of pixels of masks."""
+
+
 def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem]:
     """Check every shard of the data folder `path`, and simulate some of its episodes again.
 
@@ -53,7 +57,7 @@ def check_dataset(path: str | Path, *, replays: int = 2) -> Iterator[CheckedItem
 
     Args:
         replays: how many episodes of each split to simulate again from their specs and actions,
-            spread evenly; the results must be identical.
+            spread evenly; the results must be identical, up to rounding.
 
     Raises:
         DataError: there is no dataset, or its card cannot be read.
@@ -172,8 +176,27 @@ def _replays(
         except AcwmError as error:
             yield CheckedItem(what, str(error))
             continue
-        yield CheckedItem(what, _replay_problem(stored, again))
+        problem, note = _replay_problem(stored, again), ""
+        if problem and _differs_by_rounding(stored, again):
+            problem, note = None, "equal up to rounding, as on another kind of processor"
+        yield CheckedItem(what, problem, note)
     environment.close()
+
+
+def _differs_by_rounding(stored: Episode, again: Episode) -> bool:
+    """Whether episodes differ by as little as kinds of processors do; `data.md` says how much."""
+    if stored.video.shape != again.video.shape or stored.states.keys() != again.states.keys():
+        return False
+    off = np.abs(stored.video.astype(np.int16) - again.video)
+    return (
+        float(off.mean()) < ROUNDING
+        and float((stored.masks != again.masks).mean()) < ROUNDING
+        and np.array_equal(stored.contacts, again.contacts)
+        and all(
+            np.allclose(values, again.states[name], rtol=1e-4, atol=1e-6)
+            for name, values in stored.states.items()
+        )
+    )
 
 
 def _replay_problem(stored: Episode, again: Episode) -> str | None:
@@ -186,5 +209,5 @@ def _replay_problem(stored: Episode, again: Episode) -> str | None:
         return None
     return (
         f"simulated again, it differs in {' and '.join(other[:2])}: the dataset was made with "
-        "another simulator version or machine"
+        "another version of the simulator"
     )

@@ -18,6 +18,7 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Split
 from acwm_core.errors import AcwmError, DataError
+from acwm_core.files import inside
 from acwm_core.plugins import catalog
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
@@ -87,7 +88,7 @@ class Published(Format):
         low, high = np.array(card.action.low), np.array(card.action.high)
         folders = {split: folder for folder, split in FOLDERS.items()}
         for split in export.splits:
-            folder = export.folder / category / name / folders[split]
+            folder = inside(export.folder, f"{category}/{name}/{folders[split]}")
             folder.mkdir(parents=True)
             entries: list[dict[str, Any]] = []
             for episode in export.episodes(split):

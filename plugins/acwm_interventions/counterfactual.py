@@ -127,7 +127,7 @@ def simulate_branches(
         asked = [Again(episode.spec, actions, len(episode.video)) for actions in taken]
         truths = [
             Prediction.truth(made, environment.card, estimator, clip)
-            for made in simulate_again(environment, episodes, asked)
+            for made in simulate_again(environment, asked)
         ]
         yield branches, replace(truths[0], branches=tuple(truths[1:]))
 

@@ -67,7 +67,7 @@ def compare_ensembles(
         starts = evaluator.config.ensemble_starts
         moved = Again(episode.spec, episode.actions, len(episode.video), amounts[-1])
         asked = [moved._replace(start=start) for start in range(1, starts + 1)]
-        simulated = [each.video for each in simulate_again(environment, episodes, asked)]
+        simulated = [each.video for each in simulate_again(environment, asked)]
         with noting(clip.where, *evaluator.world_model.children()):
             futures = _futures(evaluator, truth, simulated)
         seen = {name: [each[clip.given - 1 :] for each in of] for name, of in futures.items()}

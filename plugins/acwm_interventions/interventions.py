@@ -195,7 +195,7 @@ def perturbed(
     errors: list[NDArray[np.float64]] = []
     for clip, episode in read_clips(clips, episodes):
         asked = Again(episode.spec, episode.actions, len(episode.video), perturbation=1)
-        (moved,) = simulate_again(environment, episodes, [asked])
+        (moved,) = simulate_again(environment, [asked])
         truth = Prediction.truth(episode, evaluator.card, evaluator.estimator, clip)
         made = replace(truth, video=as_clip(moved.video), kind="perturbed")
         scores.append(score(made, evaluator.metrics))

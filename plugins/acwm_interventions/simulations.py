@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import open_shard, write_shard
 from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.evaluation.references import REFERENCES, package_hash
+from acwm_core.evaluation.references import cached, package_hash
 
 
 class Again(NamedTuple):
@@ -38,21 +37,18 @@ class Again(NamedTuple):
         return {**self._asdict(), "spec": self.spec.to_dict(), "actions": actions}
 
 
-def simulate_again(
-    environment: Environment, episodes: EpisodeDataset, asked: Sequence[Again]
-) -> list[Episode]:
-    """Simulate what is asked, or read what an earlier evaluation on these data simulated.
+def simulate_again(environment: Environment, asked: Sequence[Again]) -> list[Episode]:
+    """Simulate what is asked, or read what an earlier evaluation simulated.
 
-    It is kept in the folder of the references, if that can be written, as one shard per call. A
+    It is kept in the user's cache of references, if that can be written, as one shard per call. A
     shard that another version of the simulator made is replaced.
 
     Args:
-        environment: what simulated `episodes`.
-        episodes: the data that are evaluated.
+        environment: what simulates.
         asked: the episodes that are wanted.
     """
     key = hashlib.sha256(json.dumps([each.facts() for each in asked]).encode()).hexdigest()
-    file = episodes.path / REFERENCES / f"simulated-{key[:16]}.tar"
+    file = cached(f"simulated-{key[:16]}.tar")
     made_by = _versions(environment)
     with contextlib.suppress(DataError, OSError):  # not there yet, damaged, or of another version
         return _read(file, asked, made_by)
@@ -61,8 +57,8 @@ def simulate_again(
         for spec, actions, frames, moved, start in asked
     ]
     if None not in made_by.values():
-        with contextlib.suppress(OSError):  # e.g. a read-only dataset
-            file.parent.mkdir(exist_ok=True)
+        with contextlib.suppress(OSError):  # e.g. a read-only cache
+            file.parent.mkdir(parents=True, exist_ok=True)
             _write(file, made, environment.card.fps, made_by)
     return made
 

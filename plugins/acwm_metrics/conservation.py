@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from acwm_core.env.physics import Constant, Physics
+from acwm_core.env.physics import Constant, Gap, Physics
 from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means, start_of, truth_of
 from acwm_metrics.presence import out_of_sight, seen_once
-from acwm_metrics.seen import lost_shapes, measured, share_found
+from acwm_metrics.seen import (
+    both_lost,
+    held_among_true,
+    lost_shapes,
+    measured,
+    share_found,
+)
 
 LASTING = 3
 """Frames in a row for which solid bodies must overlap, so that it is not just an estimator error.
@@ -81,11 +87,12 @@ class Penetration(PhysicalMetric):
 
     They meet in the frames in which they overlap, or almost do: their distance is below what the
     estimator's error can make an overlap. If bodies never meet, nothing is measured. A body that is
-    not found stays where it was last seen, so others may run into it.
+    not found stays where it was last seen, so others may run into it; if neither of two is found,
+    so may each by its true motion.
     """
 
     name = "penetration"
-    definition = 2
+    definition = 3
     unit = "m"
 
     def lacking(self, physics: Physics) -> str | None:
@@ -95,7 +102,7 @@ class Penetration(PhysicalMetric):
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:
         """The depth in each frame in which bodies meet, `[T]`, in m; 0 where nothing overlaps."""
         gaps = [(gap, gap.solid) for gap in physics_of(prediction).gaps if gap.solid is not None]
-        depths = np.stack([-measured(gap, prediction, held=True) for gap, _ in gaps], 1)
+        depths = np.stack([_depth(gap, prediction) for gap, _ in gaps], 1)
         meeting = (depths > [-solid for _, solid in gaps]).any(1)
         deepest = np.where(np.isnan(depths), -np.inf, depths).max(1)
         return np.where(meeting, np.maximum(deepest, 0.0), np.nan)
@@ -103,6 +110,17 @@ class Penetration(PhysicalMetric):
     def coverage(self, prediction: Prediction, curve: NDArray[np.float64]) -> float:
         """Share of the bodies and frames in which a state is found."""
         return share_found(prediction, physics_of(prediction).readings)
+
+
+def _depth(gap: Gap, prediction: Prediction) -> NDArray[np.float64]:
+    """By how much two bodies overlap in each frame, `[T]`; negative is their distance."""
+    depth = -measured(gap, prediction, held=True)
+    lost = both_lost(prediction, gap.pair)
+    if not lost.any():
+        return depth
+    start = start_of(prediction)
+    either = [-gap.measure(held_among_true(prediction, name), start) for name in gap.pair]
+    return np.where(lost, np.fmax(*either), depth)
 
 
 class Violations(PhysicalMetric):

@@ -93,20 +93,49 @@ def held_of(prediction: Prediction) -> Observation:
     return prediction.once(held_of, lambda: _held(prediction))
 
 
-def _held(prediction: Prediction) -> Observation:
+def held_among_true(prediction: Prediction, name: str) -> Observation:
+    """As `held_of`, but of the bodies that are not found only `name` keeps the state last seen.
+
+    The others have their true states, so that they run into it where they do so in truth.
+    """
+    return prediction.once((held_among_true, name), lambda: _held(prediction, name))
+
+
+def _held(prediction: Prediction, name: str | None = None) -> Observation:
     seen = seen_of(prediction)
     states = dict(seen.states)
     for reading in physics_of(prediction).readings:
-        missing = ~found(seen, reading)
-        fill = missing & shown(prediction, reading.instances)
-        for frame in range(1, len(fill)):  # what vanished in sight is lost until it is found again
-            fill[frame] |= missing[frame] & fill[frame - 1]
+        fill = lost_bodies(prediction, reading)
         if fill.any():
+            true = by_body(np.array(prediction.states[reading.field], np.float64), reading)
             states[reading.field] = values = np.array(states[reading.field], np.float64)
-            bodies, start = by_body(values, reading), prediction.states[reading.field][:1]
-            last = last_seen(bodies, missing, by_body(np.array(start, np.float64), reading)[0])
-            bodies[fill] = last[fill]
+            bodies, missing = by_body(values, reading), ~found(seen, reading)
+            last = last_seen(bodies, missing, true[0])
+            held = [name in (None, each) for each in reading.instances]
+            bodies[fill] = np.where(np.array(held)[:, None], last, true)[fill]
     return Observation(seen.masks, states)
+
+
+def lost_bodies(prediction: Prediction, reading: Reading) -> Mask:
+    """Whether each body of a reading is not found though the true video shows it, `[T, n]`.
+
+    What vanished in sight is lost until it is found again.
+    """
+    missing = ~found(seen_of(prediction), reading)
+    lost = missing & shown(prediction, reading.instances)
+    for frame in range(1, len(lost)):
+        lost[frame] |= missing[frame] & lost[frame - 1]
+    return lost
+
+
+def both_lost(prediction: Prediction, pair: Sequence[str]) -> Mask:
+    """Whether neither of two bodies is found in a frame, `[T]`."""
+    lost = {name: np.zeros(len(prediction.masks), np.bool_) for name in pair}
+    for reading in physics_of(prediction).readings:
+        for name, each in zip(reading.instances, lost_bodies(prediction, reading).T, strict=True):
+            if name in lost:
+                lost[name] |= each
+    return np.logical_and.reduce(list(lost.values()))
 
 
 def last_seen(

@@ -20,7 +20,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.videos import join_panels, panels
-from acwm_core.files import held, writing
+from acwm_core.files import held, inside, writing
 from acwm_core.plugins import catalog
 from acwm_play.simulator import TimeStep
 
@@ -84,7 +84,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
         DataError: the folder holds another dataset, is in use or cannot be written.
     """
     height, width = card.frame_size
-    folder = out / f"{card.name}-{height}x{width}"
+    folder = inside(out, f"{card.name}-{height}x{width}")
     with _writing, writing(folder):  # one tab at a time
         folder.mkdir(parents=True, exist_ok=True)
         with held(folder):

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 
 from acwm_core.evaluation.results import MetricInfo, Summary
 from acwm_core.evaluation.views import metric_and_view
-from acwm_report.comparison import checksums
 from acwm_report.draws import draws_phrase
 from acwm_report.run import described
+from acwm_report.same_data import agree, checksums, given_frames, mean_still_scores, same_recipe
 from acwm_report.scores import (
     ModelScores,
     ScoreGrid,
     compared_metrics,
-    failures,
     model_scores,
     scored_shares,
+    shortcomings,
 )
 from acwm_report.table import Row, Table
 from acwm_report.titles import clips_title, split_title
@@ -48,21 +48,45 @@ class Board:
 
 def boards_of(entries: Mapping[str, Summary], uses: Sequence[Use] = ()) -> list[Board]:
     """Group runs that predicted the same clips (same environment, protocol and data) in tables."""
-    groups: dict[tuple[str, ...], dict[str, Summary]] = {}
+    groups: dict[tuple[str, ...], list[dict[str, Summary]]] = {}
     for name, summary in entries.items():
-        hashes = checksums(summary)
-        clips = [
-            f"{split} {hashes.get(split, '')} {each.scores.clips} {each.scores.episodes}"
-            for split, each in summary.splits.items()
-        ]
-        place = summary.parts["env"], _protocol(summary), *clips
-        groups.setdefault(place, {})[name] = summary
-    return [_board(number, groups[place], uses) for number, place in enumerate(sorted(groups))]
+        alike = groups.setdefault(_clips_of(summary), [])
+        for group in alike:
+            if _same_data(next(iter(group.values())), summary):
+                group[name] = summary
+                break
+        else:
+            alike.append({name: summary})
+    found = [group for place in sorted(groups) for group in groups[place]]
+    return [_board(number, group, uses) for number, group in enumerate(found)]
+
+
+def _clips_of(summary: Summary) -> tuple[str, ...]:
+    """What decides which clips are predicted from how much, apart from the data."""
+    clips = [
+        f"{split} {each.scores.clips} {each.scores.episodes} {_longest(each.horizon)}"
+        for split, each in summary.splits.items()
+    ]
+    damaged = [name for name in summary.left_out if name.startswith("episode ")]
+    return summary.parts["env"], _protocol(summary), *clips, *damaged
+
+
+def _longest(horizon: Mapping[str, Mapping[str, Sequence[float | None]]]) -> int:
+    """The number of frames that are scored of the longest clip."""
+    return max((len(curve) for row in horizon.values() for curve in row.values()), default=0)
+
+
+def _same_data(first: Summary, second: Summary) -> bool:
+    ours, theirs = checksums(first), checksums(second)
+    if all(ours.get(split) == theirs.get(split) for split in first.splits):
+        return True
+    return same_recipe(first, second) and agree(mean_still_scores(first), mean_still_scores(second))
 
 
 def _board(number: int, entries: Mapping[str, Summary], uses: Sequence[Use]) -> Board:
     first = next(iter(entries.values()))
-    hashes = {s: h for s, h in checksums(first).items() if s in first.splits}
+    found = [*map(checksums, entries.values())]
+    hashes = {s: dict.fromkeys(each[s][:8] for each in found if s in each) for s in first.splits}
     keys = {name: f"entry-{number}-{place}" for place, name in enumerate(entries)}
     scores = {name: model_scores(summary) for name, summary in entries.items()}
     tables = {
@@ -73,7 +97,7 @@ def _board(number: int, entries: Mapping[str, Summary], uses: Sequence[Use]) -> 
     return Board(
         environment=first.parts["env"],
         protocol=_protocol(first),
-        data=", ".join(f"{split} {hashed[:8]}" for split, hashed in hashes.items()),
+        data=", ".join(f"{split} {' ≈ '.join(each)}" for split, each in hashes.items()),
         clips=", ".join(
             f"{split_title(s)}: {clips_title(each.scores)}" for s, each in first.splits.items()
         ),
@@ -162,7 +186,7 @@ def _remarks(name: str, summary: Summary, metrics: Iterable[str]) -> list[str]:
     where = [name] if summary.handed_in and name != summary.parts["model"] else []
     drawn = {split: draws_phrase(summary, split) for split in summary.splits}
     found = [f"{split_title(split)}: {phrase}" for split, phrase in drawn.items() if phrase]
-    return [*where, *failures(summary), *_scored(summary, [*metrics]), *found]
+    return [*where, *shortcomings(summary), *_scored(summary, [*metrics]), *found]
 
 
 def _scored(summary: Summary, metrics: Sequence[str]) -> list[str]:
@@ -178,7 +202,10 @@ def _scored(summary: Summary, metrics: Sequence[str]) -> list[str]:
 def _protocol(summary: Summary) -> str:
     chosen = summary.provenance["evaluation"]
     names = [each for each in ("frames", "cuts", "episodes") if chosen.get(each) is not None]
-    return ", ".join([summary.protocol, *(f"{chosen[name]} {name}" for name in names)])
+    words = [summary.protocol, *(f"{chosen[name]} {name}" for name in names)]
+    if (given := given_frames(summary)) > 1:
+        words.append(f"{given} given frames")
+    return ", ".join(words)
 
 
 def _place(summary: Summary) -> float:

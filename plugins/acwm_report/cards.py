@@ -9,8 +9,10 @@ from pathlib import Path
 from acwm_core.evaluation.results import VIDEOS, Summary
 from acwm_core.evaluation.storage import result_file
 from acwm_report.boards import Board, title_of
-from acwm_report.entry import Entry
+from acwm_report.entry import MOST_PARAMETERS, Entry
 from acwm_report.videos import EmbeddedVideo
+
+STEPS = ("training_steps", "sampling_steps")
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,10 @@ def entry_facts(name: str, summary: Summary, entry: Entry) -> list[tuple[str, st
     """What is known of an entry, with a heading each."""
     facts, kinds = summary.provenance, ("model", "conditioner", "codec")
     size = facts["parameters"] if entry.parameters is None else entry.parameters
+    counts = {"parameters": size, **{n: facts[n] for n in STEPS if not summary.handed_in}}
+    for what, count in counts.items():
+        if count is not None and not 0 <= count <= MOST_PARAMETERS:
+            raise ValueError(f"{what} {count} is no possible number")
     told = {
         "Model": "" if summary.handed_in else " · ".join(summary.parts[kind] for kind in kinds),
         "Size": "" if size is None else f"{size / 1e6:.3g} M parameters",

@@ -13,7 +13,7 @@ from acwm_report.figures import Chart, Curve, Numbers
 from acwm_report.metrics_file import logged
 from acwm_report.run import EvaluatedRun, described
 from acwm_report.table import Scale
-from acwm_report.titles import ROWS, split_title
+from acwm_report.titles import ROWS, counted, split_title
 from acwm_severity.curves import SeverityCurve, read_severity
 
 SECONDS = "seconds after the first frame"
@@ -184,7 +184,8 @@ def _severity(curve: SeverityCurve, key: str) -> Chart:
         style = "--" if kind == "codec" else "-"
         curves.append(Curve(ROWS[kind].title, kind, places, values, style, low, high))
     name = curve.factor.replace("_", " ")
-    title, file = f"{name}, {curve.episodes} episodes each", f"{key}-severity-{curve.factor}"
+    title = f"{name}, {counted(curve.episodes, 'episode')} each"
+    file = f"{key}-severity-{curve.factor}"
     axes = f"{name} ({curve.unit})" if curve.unit else name, _axis(info, scale)
     return Chart(title, file, curves, *axes, True, ticks, shaded=shaded)
 

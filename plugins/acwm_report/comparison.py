@@ -16,6 +16,7 @@ from acwm_core.evaluation.results import MetricInfo, Score, Summary, write_json
 from acwm_core.evaluation.statistics import holm, paired_bootstrap
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.files import writable
+from acwm_report.same_data import agree, checksums, given_frames, same_recipe, still_scores
 from acwm_report.uses import Use, uses_of
 
 Rows = dict[tuple[str, int, int, int], Score]
@@ -114,11 +115,12 @@ def compare_runs(
     if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
         raise DataError("a comparison needs at least two different runs")
     summaries = dict(zip(run_labels(folders), map(Summary.read, folders), strict=True))
-    warnings = _comparability(summaries)
+    results = dict(zip(summaries, map(read_scores, folders), strict=True))
+    warnings = _comparability(summaries, results)
     first = next(iter(summaries.values()))
     names = _shared("metric", metrics, [_compared(each) for each in summaries.values()])
     chosen = _shared("split", splits, [list(each.splits) for each in summaries.values()])
-    rows = dict(zip(summaries, map(_model_rows, folders), strict=True))
+    rows = {label: _model_rows(each) for label, each in results.items()}
     metrics_of = {name: first.metrics[name] for name in names}
     warnings += _definitions(summaries, names)
     found = [
@@ -184,26 +186,50 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
     return [str(folder) for folder in folders]
 
 
-def _comparability(summaries: Mapping[str, Summary]) -> list[str]:
+def _comparability(
+    summaries: Mapping[str, Summary], results: Mapping[str, Sequence[Score]]
+) -> list[str]:
     """Warnings about differences besides the models; an error if the clips cannot be paired."""
     (label, first), *others = summaries.items()
+    warnings = [f"{name} is {s.unfinished}" for name, s in summaries.items() if s.unfinished]
     for other, summary in others:
         both = f"{label} and {other} were evaluated"
         for what, fact, remedy in _MUST_AGREE:
             if fact(first) != fact(summary):
                 raise DataError(f"{both} {what} ({fact(first)}, {fact(summary)}): {remedy}")
         ours, theirs = checksums(first), checksums(summary)
-        for split in ours.keys() & theirs.keys():
-            if ours[split] != theirs[split]:
-                data = f"on other test data ({split} {ours[split][:8]}, {theirs[split][:8]})"
-                raise DataError(f"{both} {data}: evaluate both with the same --data")
-    warnings: list[str] = []
+        for split in [split for split in ours if theirs.get(split, ours[split]) != ours[split]]:
+            hashes = f"{split} {ours[split][:8]}, {theirs[split][:8]}"
+            if not _equal_but_for_rounding(summaries, results, label, other, split):
+                raise DataError(
+                    f"{both} on other test data ({hashes}): evaluate both with the same --data"
+                )
+            warnings.append(
+                f"the test data of {label} and {other} were simulated on other kinds of machines "
+                f"({hashes}); still pictures of both have the same scores, so they are compared"
+            )
     for what, fact in _SHOULD_AGREE:
         facts = {label: fact(summary) for label, summary in summaries.items()}
         facts = {label: each for label, each in facts.items() if each is not None}
         if len(set(map(repr, facts.values()))) > 1:
             warnings.append(f"{what} differ: " + ", ".join(f"{k} {v}" for k, v in facts.items()))
     return warnings
+
+
+def _equal_but_for_rounding(
+    summaries: Mapping[str, Summary],
+    results: Mapping[str, Sequence[Score]],
+    first: str,
+    second: str,
+    split: str,
+) -> bool:
+    metrics = [
+        name
+        for name, info in summaries[first].metrics.items()
+        if info.reads == "pixels" and name in summaries[second].metrics
+    ]
+    ours, theirs = (still_scores(results[each], split, metrics) for each in (first, second))
+    return same_recipe(summaries[first], summaries[second]) and agree(ours, theirs)
 
 
 def _definitions(summaries: Mapping[str, Summary], names: Sequence[str]) -> list[str]:
@@ -220,11 +246,6 @@ def _hashes(summary: Summary) -> dict[str, str]:
     return {name: summary.provenance[f"{name}_sha256"] for name in names}
 
 
-def checksums(summary: Summary) -> dict[str, str]:
-    """SHA-256 of the test data, by split."""
-    return summary.provenance["dataset"]["checksums"]
-
-
 def _estimator(summary: Summary) -> str:
     facts: Mapping[str, str] = summary.provenance.get("estimator") or {}
     return " and ".join(f"{what} {hashed}" for what, hashed in facts.items()) or "none"
@@ -238,12 +259,16 @@ def _mode(summary: Summary) -> str | None:
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
     ("on other environments", lambda s: s.parts["env"], "their clips cannot be compared"),
     ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
+    (
+        "from other numbers of given frames",
+        lambda s: str(given_frames(s)),
+        "evaluate both with the same evaluation.context_frames",
+    ),
 )
 
 _SHOULD_AGREE: tuple[tuple[str, Callable[[Summary], Any]], ...] = (
     ("numbers of sampling steps", lambda s: s.provenance.get("sampling_steps")),
     ("ways of rolling forward", _mode),
-    ("numbers of given frames", lambda s: s.provenance.get("context_frames", 1)),
     ("seeds of the noise", lambda s: s.provenance["evaluation"].get("seed")),
     ("estimators of states", _estimator),
     ("versions of acwm", lambda s: s.provenance["versions"]["acwm"]),
@@ -262,8 +287,8 @@ def _shared(kind: str, wanted: Sequence[str], offered: Sequence[Sequence[str]]) 
     return [name for name in common if name in wanted] if wanted else common
 
 
-def _model_rows(run: Path) -> Rows:
-    found = (each for each in read_scores(run) if each.kind == "model")
+def _model_rows(results: Sequence[Score]) -> Rows:
+    found = (each for each in results if each.kind == "model")
     return {(each.split, each.episode, each.start, each.frames): each for each in found}
 
 

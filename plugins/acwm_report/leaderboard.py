@@ -8,7 +8,7 @@ from pathlib import Path
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.files import inside
+from acwm_core.files import regular_file
 from acwm_planning.results import PLANS
 from acwm_report.boards import boards_of
 from acwm_report.cards import cards_of, entry_facts
@@ -85,7 +85,7 @@ def collect(folder: Path) -> Collection:
         below = run != folder and run.is_relative_to(folder)
         name = str(run.relative_to(folder)) if below else folder.resolve().name
         try:
-            digest = file_sha256(inside(folder, file))
+            digest = file_sha256(regular_file(folder, file))
             if digest in seen:
                 found.copies += 1
                 continue

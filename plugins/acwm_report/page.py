@@ -207,6 +207,7 @@ def _page_templates() -> Any:
         action_traces=action_traces,
         branch_title=titles.branch_title,
         commands_of=commands,
+        counted=titles.counted,
         episode_table=tables.episode_table,
         label_title=titles.label_title,
         outdated_curves=charts.outdated_curves,

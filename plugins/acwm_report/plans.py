@@ -12,6 +12,7 @@ from acwm_planning.jobs import PlanningJob
 from acwm_planning.results import PLAN_SUMMARY, PLANS, PlanTable, RowSummary
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import MISSING, PERCENT, Cell, Column, Row, Scale, Table
+from acwm_report.titles import counted
 
 CAPTION = (
     "Intervals of shares are exact (Clopper and Pearson), those of distances are bootstrapped over "
@@ -57,7 +58,8 @@ def plan_table(found: PlanTable) -> Table:
     """Success and final distance of each way to act, on the same episodes."""
     scale = distance_scale(found.unit)
     rows = [_row(row, scale) for row in found.rows]
-    head = f"{found.task} · {max((row.episodes for row in found.rows), default=0)} episodes"
+    episodes = max((row.episodes for row in found.rows), default=0)
+    head = f"{found.task} · {counted(episodes, 'episode')}"
     name = f"plans-{found.task}"
     return Table(head, _columns(scale.unit), rows, "Controller", CAPTION, name)
 

@@ -16,6 +16,7 @@ from acwm_core.evaluation.statistics import MIN_EPISODES
 from acwm_core.evaluation.storage import read_scores
 from acwm_core.files import inside
 from acwm_core.plugins import catalog
+from acwm_report.entry import entry_of
 from acwm_report.table import Scale
 from acwm_report.titles import OVER
 
@@ -35,6 +36,8 @@ class EvaluatedRun:
     def read(cls, folder: Path, key: str) -> EvaluatedRun:
         """Read an evaluated run from its folder."""
         summary = Summary.read(folder)
+        if summary.handed_in:
+            entry_of(folder, summary)  # refuses a card that a page must not show
         summary = replace(summary, metrics=described(summary.metrics))
         return cls(folder, summary, read_scores(folder), key)
 

@@ -98,10 +98,11 @@ def compared_metrics(summaries: Sequence[Summary]) -> dict[str, MetricInfo]:
     return {n: info for n, info in pixels.items() if n in published} or pixels
 
 
-def failures(summary: Summary) -> list[str]:
-    """A phrase for each split in which predictions of the model are not finite."""
+def shortcomings(summary: Summary) -> list[str]:
+    """Phrases for a model whose training has not ended, and for predictions that are not finite."""
     found = {s: each.scores.failures() for s, each in summary.splits.items()}
-    return [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
+    failures = [f"{split_title(split)}: {phrase}" for split, phrase in found.items() if phrase]
+    return [phrase for phrase in (summary.unfinished, *failures) if phrase]
 
 
 def scored_shares(summary: Summary, metrics: Iterable[str]) -> list[str]:
@@ -132,7 +133,7 @@ def main_table(runs: Sequence[EvaluatedRun]) -> Table | None:
         if environments.count(environments[number]) > 1:
             words.reverse()
         clips = {clips_title(each.scores) for each in summary.splits.values()}
-        note = ", ".join([words[1], summary.protocol, *sorted(clips), *failures(summary)])
+        note = ", ".join([words[1], summary.protocol, *sorted(clips), *shortcomings(summary)])
         link = run.key if len(runs) > 1 else ""
         rows.append(Row(words[0], grid.cells(models[number]), note, strong=True, link=link))
         published = quoted[number]

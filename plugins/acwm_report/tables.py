@@ -28,6 +28,7 @@ from acwm_report.titles import (
     ROWS,
     branch_title,
     clips_title,
+    counted,
     label_title,
     split_title,
 )
@@ -97,7 +98,7 @@ def state_tables(run: EvaluatedRun) -> list[Table]:
                 if shares:
                     cells.insert(1, Cell.of(Estimate(shares.get(name)), PERCENT))
                 undefined = result.scores.undefined.get(name, 0)
-                left_out = f"not defined on {undefined} clips" if undefined else ""
+                left_out = f"not defined on {counted(undefined, 'clip')}" if undefined else ""
                 rows.append(
                     Row(info.title, cells, ", ".join(filter(None, (scale.unit, way, left_out))))
                 )
@@ -134,7 +135,8 @@ def response_tables(run: EvaluatedRun) -> list[Table]:
                 title = info.title if branch == "all" else branch_title(branch)
                 rows.append(Row(title, cells, note, strong=branch == "all"))
         columns = [Column(ROWS[kind].short.capitalize(), key=kind) for kind in kinds]
-        title = f"{split_title(split)} · {found.branches} branches of {found.clips} clips"
+        branches = f"{counted(found.branches, 'branch')} of {counted(found.clips, 'clip')}"
+        title = f"{split_title(split)} · {branches}"
         tables.append(Table(title, columns, rows, "Other actions", name=f"response-{split}"))
     return tables
 
@@ -156,7 +158,8 @@ def ensemble_tables(run: EvaluatedRun) -> list[Table]:
             for kind, (title, note) in ENSEMBLE_ROWS.items()
             if kind in found.distance
         ]
-        title = f"{split_title(split)} · {found.clips} clips, {found.starts} starts"
+        clips = f"{counted(found.clips, 'clip')}, {counted(found.starts, 'start')}"
+        title = f"{split_title(split)} · {clips}"
         about = (
             f"Starts differ by {1000 * found.moved:.2g} mm (standard deviation; joints in mrad), "
             f"the resolution of a pixel. The model has {found.draws} draws of each clip."
@@ -255,7 +258,7 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         scale = Scale.of([each.first_mean, each.second_mean], info)
         p = MISSING if each.p_corrected is None else f"{each.p_corrected:.2g}"
         verdict = f"{each.winner} is better" if each.winner else "no"
-        few = f"{each.episodes} episodes are too few"
+        few = f"too few: {counted(each.episodes, 'episode')}"
         cells = [
             Cell(split_title(each.split)),
             Cell.of(Estimate(defined(each.difference), each.low, each.high), scale, signed=True),

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from acwm_core.cli.tables import plain_table, print_table
+from acwm_core.cli.tables import print_table
 from acwm_report.draws import draws_phrase
-from acwm_report.titles import short_title
+from acwm_report.titles import counted, short_title
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -57,7 +57,7 @@ def print_summary(summary: Summary) -> None:
         click.echo(f"left out: {', '.join(names)}: {reason}")
     _print_curves(summary)
     if summary.published:
-        console.print(_published_table(summary, summary.published.row))
+        print_table(console, *_published_table(summary, summary.published.row))
         click.echo(about_published(summary))
 
 
@@ -81,7 +81,7 @@ def _print_remarks(scores: SetSummary, handed_in: bool) -> None:
         click.echo(f"{failures}: their scores are infinitely bad")
     undefined = (f"{name} on {count}" for name, count in scores.undefined.items())
     if text := ", ".join(undefined):
-        click.echo(f"undefined scores, not counted: {text} of {scores.clips} clips")
+        click.echo(f"undefined scores, not counted: {text} of {counted(scores.clips, 'clip')}")
 
 
 def print_severity(curve: SeverityCurve) -> None:
@@ -89,14 +89,17 @@ def print_severity(curve: SeverityCurve) -> None:
     from rich.console import Console
 
     unit = curve.metrics[curve.headline].unit
-    title = f"{curve.headline} {unit}".strip() + f", {curve.episodes} episodes each"
+    about = f"by {curve.factor} {curve.unit}".strip()
+    episodes = counted(curve.episodes, "episode")
+    title = f"{curve.headline} {unit}".strip() + f", {episodes} each, {about}"
     rows = list(curve.points[0].scores.rows)
-    table = plain_table(title, f"{curve.factor} {curve.unit}".strip(), ["severity", *rows])
+    lines: list[tuple[str, list[str]]] = []
     for point in curve.points:
         found = [_text(point.scores.rows[row][curve.headline]) for row in rows]
         severity = "train" if point.in_train else f"{point.severity:.2f}"
-        table.add_row(str(point.value), severity, *found)
-    Console(highlight=False, markup=False).print(table)
+        lines.append((str(point.value), [severity, *found]))
+    console = Console(highlight=False, markup=False)
+    print_table(console, title, ["severity", *rows], lines)
     for point in curve.points:
         if phrase := point.scores.failures():
             click.echo(f"{curve.factor} {point.value}: {phrase}")
@@ -123,9 +126,9 @@ def _split_table(
 ) -> tuple[str, list[str], list[tuple[str, list[str]]]]:
     """Title, headings and rows of the scores of a split."""
     scores = summary.splits[split].scores
-    clips = _count(scores.clips, "clip")
+    clips = counted(scores.clips, "clip")
     if scores.episodes != scores.clips:
-        clips += f" of {_count(scores.episodes, 'episode')}"
+        clips += f" of {counted(scores.episodes, 'episode')}"
     heads = [short_title(row) for row in scores.rows]
     shares = scores.shares.get("model", {})
     place = list(scores.rows).index("model") + 1
@@ -140,7 +143,8 @@ def _split_table(
         if shares:
             shown.insert(place, f"{100 * shares[name]:.0f} %" if name in shares else "")
         rows.append((f"{name} {metric.unit}".strip(), shown))
-    return f"{split}: {clips}", heads, rows
+    title = ", ".join(filter(None, (f"{split}: {clips}", summary.unfinished)))
+    return title, heads, rows
 
 
 def _print_curves(summary: Summary) -> None:
@@ -150,7 +154,7 @@ def _print_curves(summary: Summary) -> None:
         if result.steps:
             points = [(each.steps, each.scores[headline]) for each in result.steps.points]
             scores = (f"{steps}: {_text(score, interval=False)}" for steps, score in points)
-            about = f"{split} {headline} of {_count(result.steps.clips, 'clip')} by sampling steps"
+            about = f"{split} {headline} of {counted(result.steps.clips, 'clip')} by sampling steps"
             click.echo(f"{about}  {'  '.join(scores)}")
     for split, result in summary.splits.items():
         if result.counterfactual:
@@ -158,7 +162,7 @@ def _print_curves(summary: Summary) -> None:
         if result.predictability:
             horizon = result.predictability.horizon
             until = "beyond the last frame" if horizon is None else f"frame {horizon}"
-            clips = f"{_count(result.predictability.clips, 'clip')}, started a millimetre off"
+            clips = f"{counted(result.predictability.clips, 'clip')}, started a millimetre off"
             click.echo(f"{split}: predictability horizon: {until} ({clips})")
     for split, found in summary.ensembles.items():
         _print_ensemble(split, found)
@@ -174,7 +178,7 @@ def _print_ensemble(split: str, found: Ensemble) -> None:
     drawn = f"{found.draws} draws" if found.draws > 1 else "one prediction"
     click.echo(
         f"{split}: energy distance to the simulator's futures from {found.starts} starts, "
-        f"{1000 * found.moved:.2g} mm off, of {_count(found.clips, 'clip')} ({drawn}): {away}"
+        f"{1000 * found.moved:.2g} mm off, of {counted(found.clips, 'clip')} ({drawn}): {away}"
     )
     apart = apart.replace(", half against half", "")
     click.echo(f"{split}: mean distance between two futures: {apart}")
@@ -186,12 +190,15 @@ def _print_action_response(split: str, found: Counterfactual) -> None:
         gain, residual = found.gain["all"][row], found.residual["all"][row]
         if gain is not None and residual is not None:
             shown += f" (gain {gain:.2f}, residual {residual:.2f})"
-        branches = _count(found.branches, "other action sequence")
-        branches += f" in {_count(found.clips, 'clip')}"
+        branches = counted(found.branches, "other action sequence")
+        branches += f" in {counted(found.clips, 'clip')}"
         click.echo(f"{split}: action response of {row}, {branches}: {shown}")
 
 
-def _published_table(summary: Summary, row: PublishedRow) -> Table:
+def _published_table(
+    summary: Summary, row: PublishedRow
+) -> tuple[str, list[str], list[tuple[str, list[str]]]]:
+    """Title, headings and rows of the scores beside published ones."""
     from acwm_report import scores as made
 
     quoted = " ".join(["published:", row.row, row.column]).strip()
@@ -201,11 +208,11 @@ def _published_table(summary: Summary, row: PublishedRow) -> Table:
     units = {c.title: c.unit for c in columns if c.unit}
     title = "; ".join([*(f"{name} in {unit}" for name, unit in units.items()), made.CAPTION])
     heads = [f"{SHORT.get(c.group, c.group)}\n{c.title}" for c in columns]
-    table = plain_table(title, "", heads)
-    table.columns[0].no_wrap = False
-    for name, scores in models.items():
-        table.add_row(name, *(cell.text + "▼" * cell.worse for cell in grid.cells(scores)))
-    return table
+    rows = [
+        (name, [cell.text + "▼" * cell.worse for cell in grid.cells(scores)])
+        for name, scores in models.items()
+    ]
+    return title, heads, rows
 
 
 def about_published(summary: Summary) -> str:
@@ -228,10 +235,6 @@ def about_published(summary: Summary) -> str:
     return "; ".join(facts) + (f". {row.note}" if row.note else "")
 
 
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' if number != 1 else ''}"
-
-
 def print_comparison(comparison: Comparison) -> None:
     """Print which runs differ: a table per split, their usefulness, and warnings."""
     from rich.console import Console
@@ -241,7 +244,7 @@ def print_comparison(comparison: Comparison) -> None:
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
     print_tables(Console(highlight=False, markup=False), comparison, letters)
-    corrected = f"corrected for {_count(comparison.tests, 'comparison')} (Holm)"
+    corrected = f"corrected for {counted(comparison.tests, 'comparison')} (Holm)"
     if not comparison.tests:
         corrected = "none, because there are too few episodes"
     click.echo(

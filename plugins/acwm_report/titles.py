@@ -76,6 +76,12 @@ BRANCHES = {
 """Titles of counterfactual branches; all other branches shift one action dimension."""
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: ``1 clip``, ``2 clips``, ``3 branches``, ``1,000 episodes``."""
+    ending = "es" if noun.endswith(("s", "x", "ch", "sh")) else "s"
+    return f"{count:,} {noun}{ending * (count != 1)}"
+
+
 def split_title(split: str) -> str:
     """The title of a split."""
     return SPLITS.get(split, split)
@@ -94,8 +100,8 @@ def branch_title(name: str) -> str:
 def clips_title(scores: SetSummary) -> str:
     """The number of clips in words: ``12 episodes``, or ``120 clips of 12 episodes``."""
     if scores.episodes in (0, scores.clips):
-        return f"{scores.clips} episodes"
-    return f"{scores.clips} clips of {scores.episodes} episodes"
+        return counted(scores.clips, "episode")
+    return f"{counted(scores.clips, 'clip')} of {counted(scores.episodes, 'episode')}"
 
 
 def short_title(row: str) -> str:

@@ -19,6 +19,7 @@ from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.storage import refuse_other_result
 from acwm_core.evaluation.summarise import summarise
+from acwm_core.files import inside
 from acwm_core.training.run_folder import RunFolder, run_to_write
 from acwm_interventions.interventions import simulator_of
 from acwm_severity.curves import (
@@ -72,7 +73,7 @@ def sweep_severity(
     home = results_folder(folder, out) / SEVERITY
     for sweep in () if overwrite else sweeps:
         values = dict.fromkeys(f"{sweep.factor.name}={value}" for value in sweep.values)
-        refuse_other_result(home / f"{sweep.factor.name}.json", evaluator.config, values)
+        refuse_other_result(inside(home, f"{sweep.factor.name}.json"), evaluator.config, values)
 
     def curve(sweep: Sweep) -> SeverityCurve:
         factor, count = sweep.factor, evaluator.config.severity_episodes
@@ -91,7 +92,7 @@ def sweep_severity(
             left_out=list(sweep.left_out),
             provenance=provenance(evaluator, datasets, run_facts(folder, recipe, evaluator)),
         )
-        write_json(home / f"{made.factor}.json", made)
+        write_json(inside(home, f"{made.factor}.json"), made)
         return made
 
     return map(curve, sweeps)
@@ -121,9 +122,10 @@ def _generated(
     datasets: dict[str, EpisodeDataset] = {}
     for value in sweep.values:
         name = f"{sweep.factor.name}={value}"
+        place = inside(home, name)
         generate(
             card.environment.name,
-            home / name,
+            place,
             episodes={SPLIT: count},
             seed=card.seed,
             size=card.environment.frame_size,
@@ -132,7 +134,7 @@ def _generated(
             shard_episodes=4,  # so that few episodes keep several workers busy
             progress=progress,
         )
-        datasets[name] = EpisodeDataset(home / name, SPLIT)
+        datasets[name] = EpisodeDataset(place, SPLIT)
     return datasets
 
 

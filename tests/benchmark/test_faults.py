@@ -130,5 +130,6 @@ def test_damaged_files_are_told(given, folder):
     (folder / f"{CLIP}.mp4").unlink()
     (folder / CLIP).mkdir()
     assert f"{CLIP}: " in fault(given, folder)
-    Image.new("RGBA", (32, 32)).save(folder / CLIP / "0.png")
+    for number in range(9):
+        Image.new("RGBA", (32, 32)).save(folder / CLIP / f"{number}.png")
     assert "has opacity" in fault(given, folder)

@@ -96,6 +96,23 @@ def test_a_spec_of_another_dataset_is_refused(data):
     assert "another spec" in problems(data)["train/shard-00000.tar"]
 
 
+def test_a_replay_may_differ_by_rounding(data, monkeypatch):
+    """As on another kind of processor: one pixel, by one level."""
+    from acwm_formats import check
+
+    simulate = check.simulate
+
+    def elsewhere(*arguments, **options):
+        made = simulate(*arguments, **options)
+        made.video[3, 4, 5, 0] ^= 1
+        return made
+
+    monkeypatch.setattr(check, "simulate", elsewhere)
+    replayed = [each for each in check.check_dataset(data) if each.what.startswith("replay")]
+    assert replayed
+    assert all(each.problem is None and "rounding" in each.note for each in replayed)
+
+
 def test_an_episode_that_the_simulator_did_not_make_fails_its_replay(data):
     def change(info, content):
         if info.name == "train-000000.actions.npy":

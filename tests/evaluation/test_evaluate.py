@@ -207,7 +207,7 @@ def test_a_new_evaluation_replaces_the_videos_of_the_old(data, tmp_path):
 def test_it_is_told_when_the_training_is_not_at_its_end(data, tmp_path):
     parts = {"trainer": {"max_steps": 16}}
     run = tiny.make_run(tmp_path / "half", data, parts=parts, **FEW | {"videos": 0})
-    with pytest.warns(AcwmWarning, match="7 of its 16 steps"):
+    with pytest.warns(AcwmWarning, match="7 of 16 steps"):
         evaluate_run(run, progress=False)
 
 

@@ -66,6 +66,12 @@ def test_equal_settings_and_those_that_change_nothing_may_replace_it(run):
     refuse(run, "evaluation.batch_size=3", "evaluation.device=cuda")
 
 
+def test_a_curve_is_not_lost_and_one_that_was_not_made_does_not_count(run, evaluated):
+    refuse(run, "evaluation.steps_sweep=[1, 2]")
+    with pytest.raises(DataError, match=r"made with evaluation.steps_sweep=\[1, 2, 6\]"):
+        refuse(evaluated, "evaluation.steps_sweep=[]")
+
+
 def test_other_data_are_refused(run):
     with pytest.raises(DataError, match=r"made with ind_test of other data: .* --out"):
         refuse(run, ind_test="0" * 64)

@@ -1,7 +1,6 @@
 """What an evaluation simulates again is kept for the next model, and never out of date."""
 
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,11 +17,10 @@ from tests import tiny
 
 
 @pytest.fixture
-def own(data, tmp_path):
-    """A dataset of one's own, of which nothing is kept yet."""
-    folder = shutil.copytree(data, tmp_path / "data")
-    shutil.rmtree(folder / "references", ignore_errors=True)
-    return folder
+def kept(tmp_path, monkeypatch):
+    """The folder in which simulations are kept: nothing yet."""
+    monkeypatch.setenv("ACWM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache/references"
 
 
 @pytest.fixture
@@ -39,15 +37,17 @@ def simulated(monkeypatch):
     return seen
 
 
-def test_another_model_is_evaluated_on_what_was_simulated_for_the_first(own, simulated, tmp_path):
+def test_another_model_is_evaluated_on_what_was_simulated_for_the_first(
+    data, kept, simulated, tmp_path
+):
     asks = {"perturbed_episodes": 2, "ensemble_episodes": 1, "ensemble_starts": 4}
-    run = tiny.make_run(tmp_path / "run", own, videos=0, **asks)
+    run = tiny.make_run(tmp_path / "run", data, videos=0, **asks)
     first = evaluate_run(run, progress=False)
     assert simulated
     simulated.clear()
     assert evaluate_run(run, progress=False).splits == first.splits
     assert simulated == []
-    shutil.rmtree(own / "references")
+    shutil.rmtree(kept)
     assert evaluate_run(run, progress=False).splits == first.splits
 
 
@@ -60,25 +60,26 @@ def asked(episode, **changes):
 
 
 @pytest.mark.parametrize("harm", ["cut off", "another version", "a file in its place"])
-def test_what_cannot_be_used_is_simulated_again(own, simulated, harm, monkeypatch):
-    episodes = EpisodeDataset(own, "ind_test")
+def test_what_cannot_be_used_is_simulated_again(data, kept, simulated, harm, monkeypatch):
+    episodes = EpisodeDataset(data, "ind_test")
     environment, episode = simulator_of(episodes), episodes[1]
     if harm == "a file in its place":
-        (own / "references").write_text("")
-    made = simulate_again(environment, episodes, asked(episode))
+        kept.parent.mkdir()
+        kept.write_text("")
+    made = simulate_again(environment, asked(episode))
     if harm == "cut off":
-        (file,) = (own / "references").iterdir()
+        (file,) = kept.iterdir()
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     if harm == "another version":
         monkeypatch.setattr(simulations, "package_hash", lambda name: "other code")
     simulated.clear()
-    again = simulate_again(environment, episodes, asked(episode))
+    again = simulate_again(environment, asked(episode))
     assert simulated == [("ind_test", 1)] * 2
     if harm != "a file in its place":
         simulated.clear()
-        again = simulate_again(environment, episodes, asked(episode))
+        again = simulate_again(environment, asked(episode))
         assert not simulated
-        assert len([*(own / "references").iterdir()]) == 1  # the old one was replaced
+        assert len([*kept.iterdir()]) == 1  # the old one was replaced
     for one, other in zip(made, again, strict=True):
         assert one.spec == other.spec == episode.spec
         for name in ("video", "actions", "masks", "contacts"):
@@ -90,14 +91,14 @@ def test_what_cannot_be_used_is_simulated_again(own, simulated, harm, monkeypatc
     np.testing.assert_array_equal(made[0].video, episode.video)
 
 
-def test_whatever_is_asked_differently_is_simulated(simulated, tmp_path):
-    environment, episodes = Disc(size=(32, 48)), SimpleNamespace(path=tmp_path)
+def test_whatever_is_asked_differently_is_simulated(kept, simulated):
+    environment = Disc(size=(32, 48))
     episode, second = (simulate(environment, EpisodeSpec("disc", "train", k)) for k in range(2))
     changes = [{}, {"perturbation": 1.0}, {"perturbation": 2.0}, {"perturbation": 1.0, "start": 1}]
     for number, change in enumerate(changes, 1):
-        simulate_again(environment, episodes, asked(episode, **change))
+        simulate_again(environment, asked(episode, **change))
         assert len(simulated) == 2 * number
-    simulate_again(environment, episodes, asked(second))
+    simulate_again(environment, asked(second))
     shorter = [each._replace(frames=each.frames - 1) for each in asked(episode)]
-    simulate_again(environment, episodes, [s._replace(actions=s.actions[:-1]) for s in shorter])
+    simulate_again(environment, [s._replace(actions=s.actions[:-1]) for s in shorter])
     assert len(simulated) == 2 * len(changes) + 4

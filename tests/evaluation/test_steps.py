@@ -48,6 +48,6 @@ def test_summaries_from_before_there_was_a_curve_are_read(evaluated, tmp_path):
     assert all(each.steps is None for each in Summary.read(tmp_path / "run").splits.values())
 
 
-def test_the_default_is_the_published_range():
-    assert EvaluationConfig().steps_sweep == (1, 2, 4, 5, 10, 20, 50)
+def test_a_curve_is_asked_for_by_name():
+    assert EvaluationConfig().steps_sweep == ()
     assert EvaluationConfig(steps_sweep=(5, 1, 5)).steps_sweep == (1, 5)

@@ -225,6 +225,28 @@ def test_bodies_run_into_one_that_vanished():
         assert np.nanmax(Penetration().per_frame(seen)) == pytest.approx(0.2)
 
 
+def test_bodies_that_both_vanish_are_run_into_by_each_others_true_motion():
+    """a pushes b from 0.3 m on; a prediction in which both vanish before is no better."""
+    pushing = np.linspace(0, 0.9, FRAMES)
+    places = np.stack([pushing, np.maximum(0.5, pushing + 0.2)], 1)[..., None]
+    gap = Gap(
+        "pair", ("a", "b"), lambda seen, start: 0.2 - overlap(seen.states["place"]), solid=0.05
+    )
+    physics = Physics((Reading("place", "position", ("a", "b")),), gaps=(gap,))
+
+    def depth(first, then=None):
+        read = places.copy()
+        read[first:then] = np.nan
+        return Penetration().value(
+            clip(physics, true=TRUE, states={"place": places}, read={"place": read}, names="ab")
+        )
+
+    assert depth(FRAMES) == pytest.approx(0, abs=1e-9)
+    # b stays at 0.5 m, and a moves on through this place in steps of 0.1 m
+    assert depth(2) == pytest.approx(np.mean([0, 0.1, 0.2, 0.1, 0]))
+    assert depth(2, 4) == pytest.approx(0, abs=1e-9)  # both are found again when they meet
+
+
 def overlap(places):
     """Two bodies of 0.2 m overlap by what this is above 0.2 m."""
     return 0.4 - np.abs(places[:, 0, 0] - places[:, 1, 0])

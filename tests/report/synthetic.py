@@ -91,7 +91,15 @@ def run(path, results, *, environment="drift", protocol="full", **provenance):
 
 
 def facts(
-    checksums=None, steps=5, settings=None, version="0.1.0", weights="w" * 64, estimator=None
+    checksums=None,
+    steps=5,
+    settings=None,
+    version="0.1.0",
+    weights="w" * 64,
+    estimator=None,
+    given=1,
+    planned=None,
+    dataset=None,
 ):
     """Where the numbers come from."""
     return {
@@ -100,6 +108,8 @@ def facts(
         "recipe": "model: dit\n",
         "weights_sha256": weights,
         "training_steps": 200,
+        "planned_steps": planned,
+        "context_frames": given,
         "imported": None,
         "parameters": 1_900_000,
         "codec_fingerprint": "compact-1",
@@ -119,7 +129,8 @@ def facts(
             "factors": {},
             "checksums": checksums or {"ind_test": "a" * 64, "ood_test": "b" * 64},
             "versions": {},
-        },
+        }
+        | (dataset or {}),
         "versions": {"acwm": version, "python": "3.11", "torch": "2"},
         "device": "cpu (Linux x86_64, 1 threads)",
         "seconds": 1.0,

@@ -114,9 +114,11 @@ def test_what_cannot_be_paired_is_refused(tmp_path, runs):
         "on other environments (drift, reacher)": {"environment": "reacher"},
         "on other test data (ind_test aaaaaaaa, cccccccc)": {"checksums": {"ind_test": "c" * 64}},
         "by other protocols (full, acwm-phys)": {"protocol": "acwm-phys"},
+        "from other numbers of given frames (1, 5)": {"given": 5},
     }
     for number, (reason, words) in enumerate(bad.items()):
-        other = synthetic.run(tmp_path / str(number), rows, **words)
+        own = moved(rows, "copy", 0.1) if "checksums" in words else rows
+        other = synthetic.run(tmp_path / str(number), own, **words)
         with pytest.raises(DataError) as refused:
             compare_runs([base, other])
         assert f"base and {number} were evaluated {reason}" in str(refused.value)
@@ -130,6 +132,44 @@ def test_what_cannot_be_paired_is_refused(tmp_path, runs):
         compare_runs([base, runs / "like"], metrics=["psn"])
     with pytest.raises(DataError, match="no split 'train'"):
         compare_runs([base, runs / "like"], splits=["train"])
+
+
+def moved(rows, kind, decibels):
+    """The scores with those of one row changed."""
+    return [
+        synthetic.clip(each.kind, each.episode, each.values["psnr"] + decibels, split=each.split)
+        if each.kind == kind
+        else each
+        for each in rows
+    ]
+
+
+def test_data_that_another_kind_of_processor_simulated_are_compared(runs, tmp_path):
+    """Bytes and checksums differ, but still pictures are as far from the truth."""
+    base, rows = runs / "base", synthetic.clips(BASE)
+    words = {"checksums": {"ind_test": "c" * 64}, "weights": "2" * 64}
+    like = synthetic.run(tmp_path / "like", moved(rows, "copy", 1e-5), **words)
+    found = compare_runs([base, like])
+    (warning,) = [each for each in found.warnings if "other kinds of machines" in each]
+    assert "ind_test aaaaaaaa, cccccccc" in warning
+    assert found.differences
+    fewer = synthetic.run(tmp_path / "fewer", moved(rows, "copy", 1e-5)[:-8], **words)
+    assert compare_runs([base, fewer]).differences[0].episodes == len(BASE) - 2
+    for name, change in {
+        "seed": 1,
+        "factors": {"mass": 2.0},
+        "source": {"kind": "lerobot"},
+    }.items():
+        other = synthetic.run(tmp_path / name, rows, dataset={name: change}, **words)
+        with pytest.raises(DataError, match="on other test data"):
+            compare_runs([base, other])
+
+
+def test_an_unfinished_run_is_told(runs, tmp_path):
+    early = synthetic.run(tmp_path / "early", synthetic.clips(BASE), planned=3000, weights="3" * 64)
+    assert (
+        "early is trained for 200 of 3,000 steps" in compare_runs([runs / "base", early]).warnings
+    )
 
 
 def test_runs_of_one_name_are_told_apart(tmp_path):

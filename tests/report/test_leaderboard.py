@@ -60,6 +60,39 @@ def test_only_runs_that_predicted_the_same_clips_share_a_table(folder):
     assert shared.data == "ind_test aaaaaaaa, ood_test bbbbbbbb"
 
 
+def test_what_else_was_given_or_measured_has_a_board_of_its_own(tmp_path):
+    rows = synthetic.clips(SCORES)
+    synthetic.run(tmp_path / "one", rows, weights="1" * 64)
+    synthetic.run(tmp_path / "five", rows, weights="2" * 64, given=5)
+    synthetic.run(tmp_path / "again", rows, weights="3" * 64, checksums={"ind_test": "c" * 64})
+    short = [synthetic.clip(r.kind, r.episode, r.values["psnr"], frames=4) for r in rows]
+    synthetic.run(tmp_path / "short", short, weights="4" * 64)
+    boards = boards_of(collect(tmp_path).entries)
+    names = {frozenset(row.title for row in board.table.rows): board for board in boards}
+    assert names.keys() == {
+        frozenset({"one", "again"}),  # simulated by another kind of processor
+        frozenset({"five"}),
+        frozenset({"short"}),
+    }
+    assert names[frozenset({"five"})].protocol == "full, 5 given frames"
+    assert names[frozenset({"one", "again"})].data == "ind_test cccccccc ≈ aaaaaaaa"
+
+
+def test_an_unfinished_model_is_marked(tmp_path):
+    synthetic.run(tmp_path / "early", synthetic.clips(SCORES), planned=3000)
+    ((row,),) = [board.table.rows for board in boards_of(collect(tmp_path).entries)]
+    assert "trained for 200 of 3,000 steps" in row.note
+
+
+@pytest.mark.parametrize("facts", [{"parameters": -5}, {"parameters": 10**20}])
+def test_numbers_that_cannot_be_are_not_shown(facts, tmp_path):
+    path = synthetic.run(tmp_path / "run", synthetic.clips(SCORES)) / "evaluation/summary.json"
+    values = json.loads(path.read_text())
+    values["provenance"] |= facts
+    path.write_text(json.dumps(values))
+    assert "no possible number" in collect(tmp_path).broken["run/evaluation/summary.json"]
+
+
 def test_scores_are_those_of_the_files(folder):
     boards = boards_of(collect(folder).entries)
     table = next(board for board in boards if len(board.table.rows) == 2).table

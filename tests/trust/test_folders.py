@@ -4,11 +4,12 @@ import os
 import shutil
 
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.errors import DataError
-from acwm_core.files import inside, written_whole
+from acwm_core.files import inside, parse_yaml, written_whole
 from acwm_core.training.run import load_run
 from tests.report.synthetic import clips, run
 
@@ -72,6 +73,50 @@ def test_datasets_whose_own_links_lead_out_are_refused(data, mine, tmp_path, wha
     assert mine.read_text() == MINE
 
 
+OUT = ["../../evil", "/tmp/evil", "..", "a/../b", "", "a\\b", "-x/y", ".hidden", "a\nb", "x" * 300]
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_a_name_in_a_card_decides_no_folder(data, tmp_path, name):
+    """Neither that of the environment nor that of a factor, which name folders and files."""
+    card = data / "card.yaml"
+    values = yaml.safe_load(card.read_text())
+    for change in (
+        {"name": name},
+        {"factors": [{**values["environment"]["factors"][0], "name": name}]},
+    ):
+        card.write_text(yaml.safe_dump(values | {"environment": values["environment"] | change}))
+        before = {*tmp_path.rglob("*")}
+        commands = (
+            ("data", "info", data),
+            ("benchmark", "export", "--data", data, "--out", tmp_path / "deep/er/tasks"),
+            ("encode", data, "--codec", "identity"),
+        )
+        for command in commands:
+            assert "cannot be the name of" in one_sentence(*command)
+        assert {*tmp_path.rglob("*")} == before
+
+
+DEEP = "\n".join(" " * n + "a:" for n in range(2000))
+
+
+@pytest.mark.parametrize("text", ["&a [*a]", "[" * 5000, DEEP])
+def test_cards_and_recipes_that_never_end_are_refused(data, tmp_path, text):
+    (data / "card.yaml").write_text(text)
+    assert "is not a dataset card" in one_sentence("data", "info", data)
+    recipe = text if text == DEEP else f"model: {text}"
+    (tmp_path / "recipe.yaml").write_text(recipe)
+    assert "is not valid YAML" in one_sentence("fit", tmp_path / "recipe.yaml")
+
+
+def test_an_alias_is_counted_as_often_as_it_is_used():
+    base = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
+    lines = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9)]
+    assert parse_yaml(base + "".join(lines[:3]))["a3"][0][0][0][0] == "x"
+    with pytest.raises(ValueError, match="aliases stand for more than"):
+        parse_yaml(base + "".join(lines))
+
+
 @pytest.mark.parametrize("what", ["card.yaml", "checkpoints", "evaluation"])
 def test_runs_whose_own_links_lead_out_are_refused(tmp_path, mine, what):
     folder = shutil.copytree("tests/reference/first_release/run", tmp_path / "run")
@@ -83,6 +128,22 @@ def test_runs_whose_own_links_lead_out_are_refused(tmp_path, mine, what):
     place.symlink_to(elsewhere)
     with pytest.raises(DataError, match="leads out of"):
         load_run(folder)
+
+
+@pytest.mark.parametrize(
+    "what", ["card.yaml", "ind_test/manifest.jsonl", "ind_test/shard-00000.tar"]
+)
+def test_pipes_are_not_waited_for(data, tmp_path, what):
+    (data / what).unlink()
+    os.mkfifo(data / what)
+    said = one_sentence("data", "info", data)
+    assert "is no regular file" in said or "has no card.yaml" in said
+    folder = run(tmp_path / "run", clips([20.0, 21.0, 22.0]))
+    for file in ("episodes.parquet", "summary.json"):
+        (folder / "evaluation" / file).unlink()
+        os.mkfifo(folder / "evaluation" / file)
+        assert "is no regular file" in one_sentence("report", folder)
+    assert "no regular file" in one_sentence("leaderboard", folder)
 
 
 def test_links_of_others_are_none_of_acwms_business(tmp_path, data, mine):
