@@ -141,7 +141,9 @@ class Camera:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Camera:
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON or YAML."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        names = [name for name in ("eye", "target", "up") if name in values]
+        vectors: dict[str, Any] = {name: tuple(values[name]) for name in names}
+        return cls(**{**values, **vectors})
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -61,7 +61,11 @@ def quaternion_of(matrix: Array) -> Array:
     Of a matrix that is none, the nearest rotation. The sign is arbitrary.
     """
     m = real(matrix)
-    xp, at = namespace(m), lambda i, j: m[..., i, j]
+    xp = namespace(m)
+
+    def at(i: int, j: int) -> Any:
+        return m[..., i, j]
+
     trace = at(0, 0) + at(1, 1) + at(2, 2)
     rows = [[trace, at(2, 1) - at(1, 2), at(0, 2) - at(2, 0), at(1, 0) - at(0, 1)]]
     for i in range(3):

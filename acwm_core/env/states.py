@@ -49,7 +49,7 @@ def encode(field: StateField, values: Array) -> Array:
     Returns:
         `[…, rows, E]`; parts of a pose follow each other.
     """
-    numbers = rows_of(field, values)
+    numbers: Any = rows_of(field, values)
     codes = list[Any]()
     for part, columns, _ in _coded_parts(field):
         taken = numbers[..., columns]
@@ -78,7 +78,7 @@ def decode(field: StateField, codes: Array, near: Array | None = None) -> Array:
     """
     given = real(codes)
     xp, start = namespace(given), 0
-    reference = None if near is None else rows_of(field, near)
+    reference: Any = None if near is None else rows_of(field, near)
     columns, values = list[int](), list[Any]()
     for part, places, size in _coded_parts(field):
         code = given[..., start : start + size]
@@ -120,7 +120,8 @@ def transform(field: StateField, values: Array, symmetry: Symmetry, camera: Came
         ShapeError: the card does not tell how it is transformed: the field has values, angles
             without an axis, or there is no camera.
     """
-    numbers = rows_of(field, values)
+    given: Any = values
+    numbers: Any = rows_of(field, given)
     motion = None if camera is None else _motion(symmetry.mirrored, symmetry.quarter_turns, camera)
     moved, order = list[Any](), list[int]()
     for part, columns, _ in _coded_parts(field):
@@ -135,7 +136,7 @@ def transform(field: StateField, values: Array, symmetry: Symmetry, camera: Came
         moved.append(taken)
         order += columns
     joined: Any = namespace(numbers).concatenate(moved, -1)[..., np.argsort(order).tolist()]
-    return _typed(joined.reshape(tuple(np.shape(values))), values)
+    return _typed(joined.reshape(tuple(np.shape(given))), given)
 
 
 class _Motion(NamedTuple):
@@ -225,6 +226,6 @@ def _coded_parts(field: StateField) -> Iterator[tuple[Part, list[int], int]]:
 
 def _typed(values: Any, like: Any) -> Any:
     """The values with the type of numbers of `like`."""
-    return (
-        values.astype(np.asarray(like).dtype) if isinstance(values, np.ndarray) else values.to(like)
-    )
+    tensor = not isinstance(values, np.ndarray)
+    converted: Any = values.to(like) if tensor else np.asarray(values, np.asarray(like).dtype)
+    return converted

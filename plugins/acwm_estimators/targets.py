@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from acwm_core.env.camera import Camera
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.rotations import angle_code, rotation_code
+from acwm_estimators.camera import FittedCamera
 from acwm_estimators.layout import Layout, Local, Points
 from acwm_estimators.turns import heading
 
@@ -37,7 +38,7 @@ def lifted(values: Array, plane: float | None) -> Array:
     return np.concatenate([values, np.full_like(values[..., :1], plane)], axis=-1)
 
 
-def seen_points(states: States, points: Points, camera: Camera) -> Array:
+def seen_points(states: States, points: Points, camera: Camera | FittedCamera) -> Array:
     """Frame coordinates and depth `[T, rows, 3]`."""
     return camera.to_frame(lifted(rows_of(states[points.field], points), points.plane))
 
