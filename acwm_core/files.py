@@ -16,7 +16,7 @@ import tempfile
 import time
 import warnings
 import zipfile
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -46,6 +46,9 @@ FULL = 2**20
 
 MOST_VALUES = 1_000_000
 """Most values that a YAML file may hold, with those that its aliases repeat."""
+
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""How a file begins that Git LFS puts in the place of one that it has not fetched."""
 
 _NAME = re.compile(r"\w[\w .+-]{0,199}")
 
@@ -384,6 +387,85 @@ def check_inside(folder: Path, *own: str) -> None:
                 regular_file(folder, name)
 
 
+def check_tree(root: Path, *, follow_links: bool = False, advice: str = "") -> None:
+    """Refuse pipes and devices in a folder of other people's files, and links that lead out of it.
+
+    Hidden folders are left out. `root` itself may be a link.
+
+    Args:
+        root: the folder; or one file.
+        follow_links: whether links may lead out of it. Files behind them are checked too.
+        advice: what to do about a link, for the message.
+
+    Raises:
+        DataError: there is such a file; names it.
+    """
+    if root.is_dir():
+        whole = os.path.realpath(root)
+        for entry in _below(root):
+            path = Path(entry.path)
+            if not follow_links and entry.is_symlink() and not _lies_in(path, whole):
+                out = advice or "put the file there"
+                raise DataError(f"{path} is a link that leads out of {root}: {out}")
+            with contextlib.suppress(OSError):  # a link to nothing is left to whoever reads it
+                if not entry.is_file() and not entry.is_dir():
+                    check_regular(path)
+    elif root.exists():
+        check_regular(root)
+
+
+def _below(root: Path) -> Iterator[os.DirEntry[str]]:
+    """What lies in a folder and in those below it, each folder once; a link comes before what is
+    behind it. What cannot be listed is left to whoever reads it."""
+    folders, seen = [str(root)], set[tuple[int, int]]()
+    while folders:
+        folder = folders.pop()
+        with contextlib.suppress(OSError):
+            place = Path(folder).stat()
+            if (place.st_dev, place.st_ino) in seen:
+                continue
+            seen.add((place.st_dev, place.st_ino))
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    yield entry
+                    with contextlib.suppress(OSError):
+                        if not entry.name.startswith(".") and entry.is_dir():
+                            folders.append(entry.path)
+
+
+def _lies_in(path: Path, folder: str) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(folder)
+
+
+def check_regular(path: Path) -> None:
+    """Refuse a pipe, a socket or a device, which may hang or give another's data.
+
+    Raises:
+        DataError: it is one.
+        OSError: it does not exist or cannot be reached.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise DataError(f"{path} is no file: it is a folder, a pipe, a socket or a device")
+
+
+def check_fetched(path: Path) -> None:
+    """Refuse a pointer of Git LFS, which is in the place of a file that was not fetched.
+
+    Raises:
+        DataError: it is one; says how to fetch the file.
+    """
+    try:
+        check_regular(path)
+        with path.open("rb") as file:
+            start = file.read(len(LFS_POINTER))
+    except OSError:
+        return  # whoever reads it reports that
+    if start == LFS_POINTER:
+        raise DataError(
+            f"{path} is a pointer of Git LFS and not the file itself: run `git lfs pull` there"
+        )
+
+
 def parse_json(data: bytes | str) -> Any:
     """Parse JSON whose numbers are finite.
 
@@ -530,6 +612,7 @@ def load_plain(path: Path, *, on_disk: bool = False) -> object:
         with torch.serialization.safe_globals(plain), warnings.catch_warnings(action="ignore"):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except Exception as error:  # a damaged file can make the parsers raise anything
+        check_fetched(path)
         raise DataError(
             f"{path} is damaged, or holds more than numbers and text, and nothing in it was run "
             f"({type(error).__name__})"

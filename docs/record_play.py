@@ -78,7 +78,8 @@ def photograph(address: str) -> list[Image.Image]:
             now = page.evaluate(CANVASES)
             if now != before:
                 taken = page.screenshot(clip=shown)  # pyright: ignore[reportArgumentType]
-                pictures.append(Image.open(io.BytesIO(taken)).convert("RGB"))
+                picture = Image.open(io.BytesIO(taken), formats=("PNG",))
+                pictures.append(picture.convert("RGB"))
             before = now
         browser.close()
     return pictures

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.arrays import from_npz
 from acwm_core.data.card import MANIFEST, DatasetCard
 from acwm_core.data.remote import data_folder, fetch_shard, origin
-from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, from_npz, open_shard
+from acwm_core.data.shards import MEMBERS, ShardReader, ShardRecord, open_shard
 from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.symmetry import Symmetry

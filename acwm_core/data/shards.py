@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import io
 import json
 import os
 import re
 import tarfile
-import tokenize
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -25,18 +22,16 @@ from typing import IO, Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.arrays import from_npy, from_npz, to_npy, to_npz
 from acwm_core.data.video import decode_masks, decode_video, encode_masks, encode_video
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.files import parse_json, typed, written_whole
+from acwm_core.files import check_fetched, parse_json, typed, written_whole
 
 MEMBERS = ("video.mkv", "mask.mkv", "actions.npy", "states.npz", "contacts.npy", "json")
 SHARD = re.compile(r"shard-\d{5,9}\.tar")
 
-UNREADABLE = (
-    *(ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError),  # from the header of a .npy file
-)
+UNREADABLE = (ValueError, LookupError, TypeError, EOFError, ArithmeticError, RuntimeError)
 """Exceptions that decoding a damaged file raises."""
 
 Decoded = TypeVar("Decoded")
@@ -282,7 +277,7 @@ class ShardReader:
         data = self.read(position, name)
         try:
             return decode(data)
-        except (DataError, zipfile.BadZipFile, *UNREADABLE) as error:
+        except (DataError, *UNREADABLE) as error:
             raise damaged_shard(self.path, f"{name} of episode {position}: {error}") from error
 
     def array(self, position: int, name: str) -> NDArray[Any]:
@@ -338,6 +333,7 @@ def _index(path: Path, size: int, modified: int) -> ShardReader:
                 episodes.setdefault(key, {})[name] = Member(info.offset_data, info.size)
                 names.append(info.name)
     except (tarfile.TarError, ValueError) as error:
+        check_fetched(path)
         raise damaged_shard(path, str(error)) from error
     except OSError as error:
         raise damaged_shard(path, f"it cannot be read: {error.strerror}") from error
@@ -353,30 +349,3 @@ def damaged_shard(path: Path, reason: str) -> DataError:
 
 def _missing(path: Path) -> DataError:
     return DataError(f"shard {path} is missing: run the command that made it again")
-
-
-def to_npy(array: NDArray[Any]) -> bytes:
-    """The bytes of a ``.npy`` file."""
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def from_npy(data: bytes) -> NDArray[Any]:
-    """The array in a ``.npy`` file."""
-    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-
-
-def to_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """The bytes of an ``.npz`` file; they depend only on the arrays."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(arrays):
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), to_npy(arrays[name]))  # dated 1980
-    return buffer.getvalue()
-
-
-def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays in an ``.npz`` file, by name."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return dict(arrays)

@@ -54,7 +54,7 @@ def show_picture(logger: Logger, name: str, picture: NDArray[np.uint8], step: in
 @show_gif.register
 def _(logger: TensorBoardLogger, name: str, gif: Path, step: int) -> None:
     # The image tab plays GIFs; the writer's `add_video` would need moviepy.
-    with Image.open(gif) as image:
+    with Image.open(gif, formats=("GIF",)) as image:
         width, height = image.size
     make = cast(Any, summary_pb2).Summary  # generated code without type stubs
     encoded = gif.read_bytes()

@@ -16,7 +16,7 @@ from torch import Tensor
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
-from acwm_core.files import written_whole
+from acwm_core.files import check_fetched, written_whole
 from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite, float32_by_default
 from acwm_core.model.world_model import WorldModel
@@ -134,6 +134,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
             metadata: dict[str, str] = file.metadata() or {}
         facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
     except (OSError, ValueError, safetensors.SafetensorError) as error:
+        check_fetched(path)
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
     if facts.get("format") != FORMAT:
         raise TrainingError(f"{path} was not written by this version of acwm")

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from acwm_core.arrays import load_npy
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.pictures import moments, strip, to_pixels
-from acwm_core.data.shards import UNREADABLE, from_npy
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
@@ -39,6 +39,7 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_dream.captions import enlarged
+from acwm_formats.images import KINDS, opened_picture
 
 COLUMNS = 8
 """Most frames of a strip."""
@@ -239,26 +240,23 @@ def _simulate_episode(
 def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
     """Read a picture as `[3, H, W]` in [0, 1]."""
     height, width = size
-    try:
-        with Image.open(path) as picture:
-            if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
-                warnings.warn(
-                    f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
-                    "pixels: crop it before, if it should keep its shape",
-                    AcwmWarning,
-                    stacklevel=2,
-                )
-            resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
-    except (OSError, Image.DecompressionBombError, *UNREADABLE) as error:
-        raise DataError(f"{path} cannot be read as a picture: {error}") from error
+    with opened_picture(path, (*KINDS, "GIF")) as picture:
+        if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
+            warnings.warn(
+                f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
+                "pixels: crop it before, if it should keep its shape",
+                AcwmWarning,
+                stacklevel=2,
+            )
+        resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
     return torch.tensor(np.asarray(resized)).permute(2, 0, 1).float() / 255
 
 
 def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:
     """Read actions as `[N + 1, A]`; the last row is zero, and no frame follows it."""
     try:
-        rows = from_npy(path.read_bytes()).astype(np.float32)
-    except (OSError, *UNREADABLE) as error:
+        rows = load_npy(path).astype(np.float32)
+    except (OSError, ValueError, TypeError) as error:
         raise DataError(f"{path} cannot be read as a .npy array: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != spec.size or not len(rows):
         names = ", ".join(spec.names)

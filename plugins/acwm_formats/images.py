@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import struct
+import warnings
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
-from acwm_core.errors import DataError
+from acwm_core.errors import AcwmError, DataError
+from acwm_core.files import check_fetched
 
 CHANNELS = (1, 3, 4)
 """Numbers of channels that an image has: grey or depth, colours, colours and opacity."""
+
+KINDS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+"""Pictures that are read, by Pillow's names. Others that it opens are programs (EPS is run by
+Ghostscript), so the kinds are always named; the first bytes tell which one it is, not its name."""
+
+MOST_PIXELS = 2**26
+"""Pixels of a frame. Few bytes can claim more, and unpacking them would take all memory."""
+
+MOST_BYTES = 16 * MOST_PIXELS
+"""Bytes of a frame in an array: four channels of four bytes."""
+
+_DAMAGED = (
+    *(OSError, ValueError, SyntaxError, EOFError, LookupError, TypeError, ArithmeticError),
+    *(RuntimeError, MemoryError, struct.error, Image.DecompressionBombError),
+)
+"""What Pillow raises for pictures that are damaged or forged."""
 
 
 def channels_last(image: NDArray[Any]) -> NDArray[Any]:
@@ -119,19 +140,55 @@ def _eight_bits(image: NDArray[Any], span: tuple[float, float] | None) -> NDArra
 
 
 def read_image(source: Path | bytes) -> NDArray[Any]:
-    """Read a picture (PNG, JPEG, WebP, BMP, TIFF) as it is stored, upright: `to_rgb` converts it.
+    """Read a picture of one of `KINDS` as it is stored, upright: `to_rgb` converts it.
 
     Raises:
-        DataError: it is missing, damaged or of another kind.
+        DataError: it is missing, damaged, too large or of another kind.
     """
+    with opened_picture(source) as opened:
+        return _stored(opened)
+
+
+@contextlib.contextmanager
+def opened_picture(source: Path | bytes, kinds: tuple[str, ...] = KINDS) -> Generator[Image.Image]:
+    """Open a picture of one of some kinds; what goes wrong in the block becomes a `DataError`.
+
+    Raises:
+        DataError: it is missing, damaged, of another kind, or has more than `MOST_PIXELS`.
+    """
+    what = source if isinstance(source, Path) else "an image"
+    if isinstance(source, Path):
+        check_fetched(source)
+    file = io.BytesIO(source) if isinstance(source, bytes) else source
     try:
-        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as opened:
-            return _stored(opened)
+        with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+            opened = Image.open(file, formats=kinds)
+        with opened:
+            check_pixels(what, opened.height, opened.width)
+            yield opened
+    except AcwmError:
+        raise
     except FileNotFoundError:
         raise DataError(f"there is no {source}") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        what = source if isinstance(source, Path) else "an image"
-        raise DataError(f"{what} cannot be read ({error})") from error
+    except UnidentifiedImageError:
+        raise DataError(f"{what} is no picture in {', '.join(kinds)}") from None
+    except _DAMAGED as error:
+        raise DataError(f"{what} cannot be read ({error or type(error).__name__})") from error
+
+
+def check_pixels(what: object, height: int, width: int) -> None:
+    """Refuse a frame of more than `MOST_PIXELS`.
+
+    Args:
+        what: whose frame, for the message.
+
+    Raises:
+        DataError: it has more.
+    """
+    if height * width > MOST_PIXELS:
+        raise DataError(
+            f"{what} claims {height}×{width} pixels, and {MOST_PIXELS:,} are read at most"
+        )
 
 
 def _stored(opened: Image.Image) -> NDArray[Any]:

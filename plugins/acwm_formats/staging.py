@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_core.data.shards import Packed, from_npy, joined, to_npy, to_npz
+from acwm_core.arrays import from_npy, to_npy, to_npz
+from acwm_core.data.shards import Packed, joined
 from acwm_core.data.video import KEYFRAMES, MASK, VIDEO, encode_frames
 from acwm_core.env.card import ActionSpec
 from acwm_core.env.episode import EpisodeSpec, Split

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from forging import npy, zipped
 
-from acwm_core.data.shards import MEMBERS, ShardRecord, from_npy, from_npz, open_shard, write_shard
+from acwm_core.arrays import from_npy, from_npz
+from acwm_core.data.shards import MEMBERS, ShardRecord, open_shard, write_shard
 from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError

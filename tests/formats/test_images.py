@@ -1,6 +1,9 @@
 """Images of any kind become the colours that they show, or one sentence that names the option."""
 
 import io
+import struct
+import subprocess
+import zlib
 
 import numpy as np
 import pytest
@@ -93,6 +96,56 @@ def test_a_phone_that_was_turned():
     np.testing.assert_array_equal(to_rgb(read_image(file.getvalue())), COLOURS)
 
 
-def test_no_picture():
-    with pytest.raises(DataError, match="cannot be read"):
-        read_image(b"GIF89a of nothing")
+def stored(kind, image=None):
+    """A picture in a file of some kind."""
+    file = io.BytesIO()
+    (image or Image.fromarray(COLOURS)).save(file, kind)
+    return file.getvalue()
+
+
+OTHER_KINDS = {kind: stored(kind) for kind in ("EPS", "PPM", "TGA", "PCX", "GIF", "ICO", "PDF")} | {
+    "a loop of PostScript": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n{ } loop\n",
+    "EPS of Windows": b"\xc5\xd0\xd3\xc6" + bytes(26) + b"%!PS-Adobe-3.0\n",
+    "nothing": b"",
+    "text": b"GIF89a of nothing",
+}
+
+
+@pytest.mark.parametrize("data", OTHER_KINDS.values(), ids=OTHER_KINDS)
+def test_pictures_of_other_kinds_are_never_opened(tmp_path, monkeypatch, data):
+    """Pillow hands some to programs, such as EPS to Ghostscript, which runs them."""
+    monkeypatch.setattr(subprocess, "Popen", None)
+    path = tmp_path / "0.png"
+    path.write_bytes(data)
+    for source in (data, path):
+        with pytest.raises(DataError, match="no picture in PNG, JPEG, WEBP, BMP, TIFF"):
+            read_image(source)
+
+
+def test_the_bytes_tell_the_kind(tmp_path):
+    for kind in ("PNG", "WEBP", "BMP", "TIFF"):
+        path = tmp_path / f"{kind}.jpg"
+        path.write_bytes(stored(kind))
+        assert number_in(to_rgb(read_image(path))) == NUMBER
+
+
+def claiming(kind, width, height):
+    """A small picture whose header claims another size."""
+    data = bytearray(stored(kind, Image.new("L", (8, 8))))
+    if kind == "PNG":
+        data[16:24] = struct.pack(">II", width, height)
+        data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    elif kind == "BMP":
+        data[18:26] = struct.pack("<ii", width, height)
+    else:
+        place = data.index(b"\xff\xc0")
+        data[place + 5 : place + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "BMP", "JPEG"])
+@pytest.mark.parametrize("size", [(9000, 9000), (60_000, 60_000), (65_000, 1100)])
+def test_pictures_that_would_fill_the_memory(kind, size, recwarn):
+    with pytest.raises(DataError, match="pixels"):
+        read_image(claiming(kind, *size))
+    assert not recwarn.list

@@ -67,3 +67,15 @@ def test_no_large_file_is_tracked():
     large = {str(path.relative_to(ROOT)): size for path, size in sizes.items() if size > 2**20}
     assert [name for name in large if not re.search("/(weights|reference|models)/", name)] == []
     assert all(size <= 10 * 2**20 for size in large.values())
+
+
+def test_pictures_are_opened_by_their_kinds(sources):
+    """Pillow opens kinds that are programs, unless it is told which it may expect."""
+    bare = []
+    for name, text in sources.items():
+        if not name.startswith("tests/") and "Image.open(" in text:
+            for call in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
+                if ast.unparse(call.func) == "Image.open":
+                    kinds = any(keyword.arg == "formats" for keyword in call.keywords)
+                    bare += [] if kinds else [f"{name}:{call.lineno}"]
+    assert bare == []
