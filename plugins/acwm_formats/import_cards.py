@@ -16,9 +16,10 @@ from acwm_core.env.card import ActionSpec, plain_rate
 from acwm_core.env.environment import EnvironmentCard, StateField
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.env.state_field import without_dangling
+from acwm_core.errors import DataError
 from acwm_formats.alignment import Alignment
 from acwm_formats.bounds import action_bounds, beyond, outliers
-from acwm_formats.reading import ImportOptions, Reading, Scan
+from acwm_formats.reading import Bounds, ImportOptions, Reading, Scan
 from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.timeline import RecordedDataset
 
@@ -135,6 +136,12 @@ class Described:
         action = replace(action, kind=max(kinds, key=kinds.count) if kinds else action.kind)
         if self.reading.stated:
             return action
+        if isinstance(given := self.options.bounds, tuple):
+            if len(given[0]) not in (1, action.size):
+                wrong = f"{len(given[0])} dimensions, and the actions {action.size}"
+                raise DataError(f"--bounds has those of {wrong}: {', '.join(action.names)}")
+            low, high = (each * action.size if len(each) == 1 else each for each in given)
+            return replace(action, low=low, high=high)
         low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
         if self.recorded.actions.bounds is not None:
             low, high = np.minimum(low, action.low), np.maximum(high, action.high)
@@ -145,7 +152,9 @@ class Described:
     ) -> list[str]:
         """What people should know about the dataset."""
         notes, alignment = [*self.recorded.notes], self.options.alignment
-        if self.recorded.actions.bounds is None:
+        if isinstance(self.options.bounds, tuple):
+            notes.append("The bounds of actions are those of --bounds.")
+        elif self.recorded.actions.bounds is None:
             quantile = self.options.bounds == "quantile"
             which = "the range but for a hundredth at either end" if quantile else "the range"
             notes.append(f"The bounds of actions are {which} of the training episodes.")
@@ -175,7 +184,7 @@ class Described:
             "size": f"{height}x{width}",
             "environment": asked.environment,
             "test_episodes": asked.test_episodes,
-            "bounds": None if asked.bounds == "range" else asked.bounds,
+            "bounds": None if asked.bounds == "range" else bounds_as_typed(asked.bounds),
             "depth_range": asked.depth_range
             and ",".join(f"{each:g}" for each in asked.depth_range),
         }
@@ -185,6 +194,14 @@ class Described:
         names = ("fps", "tolerance", "max_gap", "shift", "on_defect")
         changed = {name: getattr(alignment, name) for name in names}
         return words | {n: v for n, v in changed.items() if v != getattr(usual, n)}
+
+
+def bounds_as_typed(bounds: Bounds) -> str:
+    """The value of ``--bounds``: a word, or LOW,HIGH of each dimension."""
+    if not isinstance(bounds, tuple):
+        return bounds
+    pairs = zip(*bounds, strict=True)
+    return ",".join(f"{each!r}" for pair in pairs for each in pair)
 
 
 def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,7 +11,7 @@ import click
 from acwm_core.cli.arguments import size
 
 if TYPE_CHECKING:
-    from acwm_formats.reading import ImportOptions
+    from acwm_formats.reading import Bounds, ImportOptions
 
 KINDS = ("absolute", "velocity", "torque", "delta")
 
@@ -36,6 +37,25 @@ def _distances(
         why = f"{value!r}: give two distances in metres, such as 0.3,2"
         raise click.BadParameter(why) from None
     return near, far
+
+
+def _bounds(_: click.Context, __: click.Parameter, value: str) -> Bounds:
+    if value == "range" or value == "quantile":
+        return value
+    try:
+        ends = [float(part) for part in value.split(",")]
+    except ValueError:
+        ends = list[float]()
+    if ends and len(ends) % 2 == 0:
+        return tuple(ends[::2]), tuple(ends[1::2])
+    if not ends and Path(value).is_dir():
+        from acwm_core.data.card import DatasetCard
+
+        action = DatasetCard.read(value).environment.action
+        return action.low, action.high
+    raise click.BadParameter(
+        f"{value!r}: give range, quantile, LOW,HIGH such as -1,1, or the folder of a dataset or run"
+    )
 
 
 def _kinds(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
@@ -97,8 +117,11 @@ OPTIONS = (
     ),
     _option(
         ["--bounds"],
-        "Bounds of actions: the range of the training episodes, or the same without outliers.",
-        type=click.Choice(["range", "quantile"]),
+        "Bounds of actions: the range of the training episodes, the same without outliers "
+        "(quantile), LOW,HIGH of all dimensions or of one after the other, or those of a dataset "
+        "or a run, given by its folder. Actions are cut to them.",
+        metavar="range|quantile|LOW,HIGH,…|FOLDER",
+        callback=_bounds,
         default="range",
     ),
     _option(

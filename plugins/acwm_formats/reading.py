@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -20,7 +21,8 @@ from acwm_formats.alignment import Aligned, Alignment, Defect, PlannedEpisode, a
 from acwm_formats.sizes import shrunk, target_size
 from acwm_formats.timeline import RecordedDataset, Recording, Recordings, TimedRecording
 
-Bounds = Literal["range", "quantile"]
+Bounds = Literal["range", "quantile"] | tuple[tuple[float, ...], tuple[float, ...]]
+"""How bounds are found; or the lower and the upper ones, of each dimension or one for all."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class ImportOptions:
             episodes; a tenth by default, and at least the five that a verdict takes (of fewer than
             ten recordings two).
         bounds: whether the bounds of actions are the range of the training episodes, or the range
-            without the outermost hundredth at either end, to which all actions are then cut.
+            without the outermost hundredth at either end; or the bounds themselves, as of earlier
+            recordings of the same robot. All actions are cut to them.
         alignment: how frames and actions are brought together.
     """
 
@@ -53,6 +56,9 @@ class ImportOptions:
         if self.depth_range and not 0 <= self.depth_range[0] < self.depth_range[1]:
             near, far = self.depth_range
             raise DataError(f"--depth-range {near:g},{far:g}: give a nearer and a farther distance")
+        for low, high in zip(*self.bounds, strict=True) if isinstance(self.bounds, tuple) else ():
+            if not -math.inf < low < high < math.inf:
+                raise DataError(f"--bounds {low:g},{high:g}: give a lower and a higher number")
 
 
 @dataclass(frozen=True)
@@ -295,7 +301,9 @@ def common_reading(
         recorded.fps,
         states,
         _action(recorded, np.shape(first.actions.values)),
-        recorded.actions.bounds is not None and not recorded.actions.widened,
+        not isinstance(options.bounds, tuple)
+        and recorded.actions.bounds is not None
+        and not recorded.actions.widened,
         recorded.instances if size == found and len(cameras) == 1 else (),
     )
 
