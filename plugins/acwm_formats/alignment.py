@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
 from acwm_formats.cadence import JITTER, SAME, Cadence, cadence, faults
+from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.timeline import Frames, Samples, TimedRecording
 
 OnDefect = Literal["refuse", "skip", "trim"]
@@ -147,6 +148,9 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
         if len(main.times) < 2:
             found.found(f"it has {len(main.times)} usable frames, and an action leads on", "")
             return found
+        seconds = float(main.times[-1] - main.times[0])
+        _check_span(seconds, 1 / main.step)
+        _check_span(seconds, float(options.fps or 0))
         measured = cadence(main.times)
         found.rate, found.seconds = measured.rate, float(main.times[-1] - main.times[0])
         said = _compare(found, recording, measured, options)
@@ -160,6 +164,15 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
         found.episodes.clear()
         found.found(str(error), "")
     return found
+
+
+def _check_span(seconds: float, rate: float) -> None:
+    """Refuse times of which one is so far off that the frames between would fill the memory."""
+    if not seconds * rate <= MOST_FRAMES:
+        raise DataError(
+            f"its frames span {seconds:.4g} s, and at {rate:.4g} frames/s these are more than "
+            f"{MOST_FRAMES:,}: a time is wrong, or in another unit"
+        )
 
 
 def _frame_stream(found: Aligned, name: str, frames: Frames) -> _Stream:

@@ -11,6 +11,7 @@ optionally with None.
 from __future__ import annotations
 
 import inspect
+import itertools
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -23,9 +24,12 @@ from acwm_core.data.remote import data_folder
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import DataError, MissingExtraError
 from acwm_core.executors import progress_bar
-from acwm_core.files import made_whole, writing
+from acwm_core.files import check_fetched, made_whole, writing
 from acwm_core.plugins import catalog
+from acwm_formats.sources import damage_of
 from acwm_formats.timeline import RecordedDataset
+
+MOST_LOOKED_AT = 1000  # files whose beginning tells why a format is not known
 
 ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"}
 
@@ -105,17 +109,11 @@ def detected_format(path: Path) -> str:
     """The name of the registered format that `path` is in.
 
     Raises:
-        DataError: there is no such path, or no format or several know it.
+        DataError: there is no such path, no format or several know it, or it is damaged.
     """
     if not path.exists():
         raise DataError(f"there is no {path}, and no format of that name: see `acwm list format`")
-    matches: list[str] = []
-    for component in catalog().registry("format"):
-        try:
-            if component.load().detect(path):
-                matches.append(component.name)
-        except MissingExtraError:
-            continue  # it cannot be read here anyway
+    matches = _matches(path)
     if len(matches) == 1:
         return matches[0]
     names = ", ".join(matches or (component.name for component in catalog().registry("format")))
@@ -123,6 +121,28 @@ def detected_format(path: Path) -> str:
         raise DataError(f"{path} is an archive: unpack it, and import the folder that comes out")
     what = "is in several formats" if matches else "is in no format that is known"
     raise DataError(f"{path} {what}: give --format, one of {names}")
+
+
+def _matches(path: Path) -> list[str]:
+    """The formats that know `path`; if none does, what is wrong with its files is raised."""
+    matches: list[str] = []
+    problem: DataError | None = None
+    for component in catalog().registry("format"):
+        try:
+            with damage_of(path):
+                if component.load().detect(path):
+                    matches.append(component.name)
+        except MissingExtraError:
+            continue  # it cannot be read here anyway
+        except DataError as error:
+            problem = problem or error
+    if problem and not matches:
+        raise problem
+    if not matches:
+        for file in itertools.islice((path, *path.rglob("*")), MOST_LOOKED_AT):
+            if file.is_file():
+                check_fetched(file)
+    return matches
 
 
 def export_dataset(

@@ -18,9 +18,24 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
+from acwm_core.files import check_fetched
 from acwm_formats.channels import STACKED, Channels, channels_of, coloured
-from acwm_formats.images import channels_last, guessed_range, is_depth, read_image, to_rgb
+from acwm_formats.images import (
+    MOST_PIXELS,
+    channels_last,
+    check_pixels,
+    guessed_range,
+    is_depth,
+    read_image,
+    to_rgb,
+)
 from acwm_formats.sources import present
+
+MOST_FRAMES = 10**7
+"""Frames of a recording: four days at 30 per second."""
+
+MOST_UNPACKED, DENSEST = 2**31, 5000
+"""Pixels that a GIF may always unpack to, and how many per byte beyond them."""
 
 CONTAINERS = {"mp4": (4, b"ftyp moov mdat wide free skip".split()), "gif": (0, [b"GIF8"])} | {
     "matroska": (0, [b"\x1a\x45\xdf\xa3"]),
@@ -150,6 +165,9 @@ def video_index(path: Path) -> VideoIndex:
 def _index(path: Path, _: str) -> VideoIndex:
     with _opened(path) as (container, stream):
         packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
+        context = stream.codec_context
+        if context.name == "gif":
+            _check_gif(path, len(packets) * context.height * context.width)
     ticks = [p.dts if p.pts is None else p.pts for p in packets]
     if not ticks or None in ticks:
         raise DataError(f"the video {path} holds no frame, or frames without times")
@@ -165,12 +183,19 @@ def _index(path: Path, _: str) -> VideoIndex:
         aspect = stream.sample_aspect_ratio or Fraction(1)
         width = round(frame.width * aspect) if aspect > 0 else frame.width
         size = (frame.height, width) if turns % 2 == 0 else (width, frame.height)
+        check_pixels(f"the video {path}", *size)
         one = len(frame.format.components) == 1 and not frame.format.has_palette
         depth = one and frame.format.components[0].bits > 8
         if frame.pts is not None and frame.pts > min(ticks):  # what comes before is not shown
             ticks = [tick for tick in ticks if tick >= frame.pts]
         ordered = np.array(sorted(ticks), np.int64)
         return VideoIndex(ordered, stream.time_base, stream.average_rate, size, turns, depth)
+
+
+def _check_gif(path: Path, pixels: int) -> None:
+    """Refuse a GIF whose few bytes unpack for minutes: a frame may change one pixel of millions."""
+    if pixels > MOST_UNPACKED and pixels > DENSEST * path.stat().st_size:
+        raise DataError(f"{path} unpacks to {pixels:,} pixels: write it as MP4")
 
 
 def _decoded(path: Path, tick: int) -> Iterator[Any]:
@@ -189,7 +214,8 @@ def _decoded(path: Path, tick: int) -> Iterator[Any]:
 
 def _sound(path: Path, container: Any, stream: Any) -> Iterator[Any]:
     """Decode, and report damage instead of concealing it."""
-    stream.codec_context.options = {"err_detect": "explode"}
+    options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
+    stream.codec_context.options = options
     for frame in container.decode(stream):
         if frame.is_corrupt:
             raise DataError(f"the video {path} is damaged at {frame.time or 0:.3f} s")
@@ -200,15 +226,20 @@ def _sound(path: Path, container: Any, stream: Any) -> Iterator[Any]:
 def _opened(path: Path) -> Generator[tuple[Any, Any]]:
     """Open a file and its video stream; FFmpeg errors inside the block become `DataError`s."""
     container: Any  # PyAV's type annotations are incomplete
+    check_fetched(path)
     kind = container_of(path)
     if kind is None:
         raise DataError(f"{path} is no MP4, MOV, MKV, WebM, AVI or GIF file")
+    place = str(path.absolute())  # "concat:a" would be a protocol of FFmpeg
     try:
-        with av.open(str(path), "r", format=kind, metadata_errors="replace") as container:
+        with av.open(place, "r", format=kind, metadata_errors="replace") as container:
             if not container.streams.video:
                 raise DataError(f"{path} holds no video")
             stream = container.streams.video[0]
-            stream.codec_context.thread_count = 1
+            context = stream.codec_context
+            check_pixels(f"the video {path}", context.height, context.width)
+            context.options = {"max_pixels": str(MOST_PIXELS)}
+            context.thread_count = 1
             yield container, stream
     except FFmpegError as error:
         raise DataError(f"the video {path} cannot be read ({error.strerror})") from error
@@ -324,7 +355,13 @@ def _image(image: Any) -> NDArray[Any]:
 
 
 def regular_times(count: int, rate: float | Fraction) -> NDArray[np.float64]:
-    """Times of `count` frames at a constant rate, from 0."""
+    """Times of `count` frames at a constant rate, from 0.
+
+    Raises:
+        DataError: there are more than `MOST_FRAMES`.
+    """
+    if count > MOST_FRAMES:
+        raise DataError(f"it claims {count:,} frames, and {MOST_FRAMES:,} are read at most")
     return np.arange(count) / float(rate) if math.isfinite(rate) else np.zeros(count)
 
 

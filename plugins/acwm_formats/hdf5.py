@@ -27,6 +27,7 @@ from acwm_formats.hdf5_layouts import (
     Layout,
     array,
     bounds_in,
+    content,
     episodes_in,
     files_of,
     layout_of,
@@ -34,6 +35,7 @@ from acwm_formats.hdf5_layouts import (
 )
 from acwm_formats.hdf5_recordings import HDF5Recordings, Place
 from acwm_formats.names import exact, is_action, pair, text_note, typed, word, words
+from acwm_formats.sources import guarded
 from acwm_formats.timeline import (
     ActionFacts,
     RecordedDataset,
@@ -57,6 +59,7 @@ class HDF5(Format):
         with opened(first_sound(files, _closed)) as file:
             return layout_of(file) is not None
 
+    @guarded
     def read(
         self,
         root: Path,
@@ -67,6 +70,7 @@ class HDF5(Format):
         rate: float | None = None,
         pixel_range: tuple[int, ...] | None = None,
         channels: Channels | None = None,
+        follow_links: bool = False,
     ) -> RecordedDataset:
         """Import an HDF5 file, or a folder of them.
 
@@ -83,6 +87,7 @@ class HDF5(Format):
             rate: Frames per second, if the files do not say it.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
+            follow_links: Whether links may lead out of the folder; those within files may not.
         """
         root = Path(root)
         files = files_of(root)
@@ -101,7 +106,8 @@ class HDF5(Format):
             channels=channels,
         )
         options = {"video": video, "actions": actions, "states": states, "rate": rate}
-        options["channels"] = channels
+        options |= {"pixel_range": typed(pixel_range), "channels": channels}
+        options["follow_links"] = follow_links
         card = _card(first) if layout.name == "acwm" else None
         splits = _splits(files, layout, reader)
         return RecordedDataset(
@@ -109,7 +115,7 @@ class HDF5(Format):
             splits=splits,
             facts={"kind": "hdf5", "name": root.resolve().name, "layout": layout.name}
             | {"bytes": sum(path.stat().st_size for path in files), "files": len(files)},
-            options=options | {"pixel_range": typed(pixel_range)},
+            options=options,
             actions=_action(card, layout),
             state=card.state if card and states is None else None,
             instances=_instances(card),
@@ -264,7 +270,7 @@ def _tests(file: Any) -> dict[str, Split] | None:
     mask = file.get("mask/valid")
     if not isinstance(mask, h5py.Dataset):
         return None
-    return {bytes(name).decode(): "ind_test" for name in mask[()]}
+    return {bytes(name).decode(): "ind_test" for name in content(mask)}
 
 
 def _action(card: EnvironmentCard | None, layout: Layout) -> ActionFacts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -11,8 +12,10 @@ from typing import Any
 
 import h5py
 
+from acwm_core.arrays import check_unpacked
 from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
+from acwm_core.files import check_fetched
 from acwm_formats.episode_bounds import (
     FIRST,
     LAST,
@@ -22,9 +25,11 @@ from acwm_formats.episode_bounds import (
     divides,
     plain,
 )
-from acwm_formats.images import CHANNELS
+from acwm_formats.frames import MOST_FRAMES
+from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import natural
 from acwm_formats.robosuite import robosuite
+from acwm_formats.sources import files_in
 
 ENDINGS = (".hdf5", ".h5")
 ALOHA_RATE = Fraction(50)  # the layout does not say it; all of its recorders have a step of 20 ms
@@ -63,11 +68,11 @@ class Layout:
 def files_of(path: Path) -> list[Path]:
     """The HDF5 files that `path` is or holds, in natural order."""
     if path.is_file():
+        check_fetched(path)
         return [path] if h5py.is_hdf5(path) else []
     if not path.is_dir():
         return []
-    found = [each for each in path.iterdir() if each.suffix.lower() in ENDINGS]
-    return sorted(found, key=lambda each: natural(each.name))
+    return files_in(path, ENDINGS)
 
 
 def opened(path: Path) -> Any:
@@ -76,6 +81,7 @@ def opened(path: Path) -> Any:
     Raises:
         DataError: it is missing, damaged or has links to other files.
     """
+    check_fetched(path)
     try:
         file = h5py.File(path, "r")
     except (OSError, RuntimeError) as error:
@@ -102,9 +108,29 @@ def array(group: Any, name: str) -> Any:
     found = group.get(name)
     if not isinstance(found, h5py.Dataset):
         raise DataError(f"{group.file.filename} has no array {group.name.rstrip('/')}/{name}")
-    if found.external or found.is_virtual:
-        raise DataError(f"{group.file.filename} keeps {found.name} in another file: copy it")
+    _check_own(found)
+    row = math.prod(found.shape[1:]) * found.dtype.itemsize
+    if row > MOST_BYTES or found.shape[:1] > (MOST_FRAMES,):
+        where = f"{found.name} in {group.file.filename}"
+        raise DataError(f"{where} claims to be {list(found.shape)}, which is more than is read")
     return found
+
+
+def content(found: Any, rows: slice | tuple[()] = ()) -> Any:
+    """What a dataset holds, or some of its rows; its data lies in the same file.
+
+    Raises:
+        DataError: it lies in another.
+        ValueError: it claims far more than the file stores.
+    """
+    _check_own(found)
+    check_unpacked(found.id.get_storage_size(), found.size * found.dtype.itemsize)
+    return found[rows]
+
+
+def _check_own(found: Any) -> None:
+    if found.external or found.is_virtual:
+        raise DataError(f"{found.file.filename} keeps {found.name} in another file: copy it")
 
 
 def episodes_in(file: Any, layout: Layout) -> list[str]:
@@ -215,7 +241,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
         beside = place.get("meta")
         for part in (place, *([beside] if isinstance(beside, h5py.Group) else [])):
             found = {
-                name: item[()]
+                name: content(item)
                 for name, item in part.items()
                 if isinstance(item, h5py.Dataset) and item.ndim in (1, 2) and _tells(name)
             }

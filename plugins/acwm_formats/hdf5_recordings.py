@@ -17,8 +17,9 @@ from acwm_core.errors import DataError
 from acwm_core.files import parse_json
 from acwm_formats.channels import Channels
 from acwm_formats.frames import ImageFrames, file_stamp, regular_times
-from acwm_formats.hdf5_layouts import Layout, array, opened
+from acwm_formats.hdf5_layouts import Layout, array, content, opened
 from acwm_formats.labels import Labels
+from acwm_formats.sources import damage_of
 from acwm_formats.timeline import Samples, TimedRecording
 
 LONGEST = 1000  # characters of a text that is kept
@@ -77,8 +78,8 @@ class HDF5Recordings:
         """Open one episode."""
         place, path = self.places[index], self.places[index].path
         ours = self.layout.name == "acwm"
-        try:
-            group = _file(path, file_stamp(path))[place.group]
+        with damage_of(path):
+            group = shared_file(path)[place.group]
             actions = rows(array(group, self.layout.actions), place)
             states = {
                 state: Samples(rows(array(group, where), place))
@@ -89,8 +90,6 @@ class HDF5Recordings:
                 for camera, where in self.layout.cameras.items()
             }
             labels, facts = (_labels(path, group), _facts(group)) if ours else (None, texts(group))
-        except (OSError, KeyError, RuntimeError, ValueError) as error:
-            raise DataError(f"{path} cannot be read ({error})") from error
         return TimedRecording(
             place.title, cameras, Samples(actions), states, self.rate, facts=facts, labels=labels
         )
@@ -111,7 +110,8 @@ class HDF5Recordings:
 
 def _labels(path: Path, group: Any) -> Labels:
     masks = StoredImages(path, f"{group.name}/masks", len(array(group, "masks")))
-    return Labels(masks, np.asarray(array(group, "contacts")[()], np.int32).reshape(-1, 3))
+    contacts = np.asarray(content(array(group, "contacts")), np.int32)
+    return Labels(masks, contacts.reshape(-1, 3))
 
 
 def _facts(group: Any) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def texts(group: Any) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     items = [*group.attrs.items()] + [
-        (name, item[()] if item.ndim == 0 else item[0])
+        (name, content(item) if item.ndim == 0 else content(item)[0])
         for name, item in group.items()
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "SO" and item.size == 1
     ]
@@ -160,10 +160,8 @@ class StoredImages(Sequence[Any]):
         return self.length
 
     def __getitem__(self, index: Any) -> Any:
-        try:
-            image = _file(self.path, file_stamp(self.path))[self.name][self.first + index]
-        except (OSError, KeyError, RuntimeError, ValueError) as error:
-            raise DataError(f"{self.path} cannot be read ({error})") from error
+        with damage_of(self.path):
+            image = shared_file(self.path)[self.name][self.first + index]
         if isinstance(image, bytes):
             return image
         return image.tobytes() if image.ndim == 1 and image.dtype == np.uint8 else image
@@ -174,14 +172,19 @@ def rows(found: Any, place: Place) -> NDArray[Any]:
 
     Raises:
         DataError: they are no numbers.
+        ValueError: they are far more than the file stores.
     """
     if found.dtype.kind not in "fiub":
         raise DataError(f"{found.name} of {found.file.filename} holds {found.dtype}, no numbers")
-    values = found[place.start : place.stop]
+    values = content(found, slice(place.start, place.stop))
     return values[:, None] if values.ndim == 1 else values
+
+
+def shared_file(path: Path) -> Any:
+    """An HDF5 file, which stays open while its episodes are read; errors as in `opened`."""
+    return _file(path, file_stamp(path))
 
 
 @functools.lru_cache(maxsize=2)
 def _file(path: Path, _: str) -> Any:
-    """A file stays open while its episodes are read."""
     return opened(path)

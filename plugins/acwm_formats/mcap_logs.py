@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from acwm_core.errors import DataError, suggest
+from acwm_core.files import check_fetched
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
 from acwm_formats.mcap_clocks import Clock, Stamps, clock_note, times_of
 from acwm_formats.mcap_images import Camera, is_image, is_video
 from acwm_formats.mcap_messages import Column, Numbers, entries, topics
-from acwm_formats.names import natural, word, words
+from acwm_formats.names import word, words
+from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.timeline import (
     ActionFacts,
     RecordedDataset,
@@ -58,6 +60,7 @@ class MCAP(Format):
         """Whether it is or holds MCAP files."""
         return bool(_files(path))
 
+    @guarded
     def read(
         self,
         root: Path,
@@ -66,6 +69,7 @@ class MCAP(Format):
         actions: str | None = None,
         states: str | None = None,
         stamps: Stamps | None = None,
+        follow_links: bool = False,
     ) -> RecordedDataset:
         """Import an MCAP file, or a folder of them, one episode each.
 
@@ -80,6 +84,7 @@ class MCAP(Format):
             states: Topics of the states, or TOPIC:FIELD, with a comma between; none by default.
             stamps: Whose times to take; by default those of headers that are of the log's clock, or
                 that all messages have.
+            follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
         files = _files(root)
@@ -105,7 +110,8 @@ class MCAP(Format):
             splits=Logs(tuple(files), log),
             facts={"kind": "mcap", "name": root.resolve().name, "files": len(files)}
             | {"bytes": sum(path.stat().st_size for path in files)},
-            options={"video": video, "actions": actions, "states": states, "stamps": stamps},
+            options={"video": video, "actions": actions, "states": states, "stamps": stamps}
+            | {"follow_links": follow_links},
             actions=ActionFacts(found.names),
             notes=_notes(first, log, [topic for topic in kinds if topic not in used]),
             summary=f"Logs of {root.resolve().name}",
@@ -137,6 +143,10 @@ class Logs:
         Frames of a video before its first key frame cannot, so it has fewer than it claims.
         """
         path, log = self.files[index], self.log
+        with damage_of(path):
+            return self._opened(path, log)
+
+    def _opened(self, path: Path, log: Log) -> TimedRecording:
         cameras, columns = _read(path, log)
         numbers = {name: each.numbers() for name, each in columns.items()}
         times = times_of(_clocks(cameras, numbers), log.stamps)
@@ -201,9 +211,10 @@ def _name(topic: str) -> str:
 
 def _files(path: Path) -> list[Path]:
     if path.is_file():
+        check_fetched(path)
         with path.open("rb") as file:
             return [path] if file.read(len(MAGIC)) == MAGIC else []
-    return sorted(path.glob("*.mcap"), key=lambda each: natural(each.name))
+    return files_in(path, [".mcap"]) if path.is_dir() else []
 
 
 def _actions(path: Path, wanted: str | None, others: Sequence[str]) -> tuple[str, Numbers]:

@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.decoder import DecoderFactory
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 from mcap_ros2.decoder import DecoderFactory as Ros2
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
-from acwm_core.files import parse_json
+from acwm_core.files import check_fetched, parse_json
 
 UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
 """Fields of messages that hold no action."""
@@ -114,12 +113,13 @@ def _decoding(path: Path, channel: Any, decoder: Any, data: bytes) -> Callable[[
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[Any]:
     """A reader of the file; what it finds wrong in the block becomes a `DataError`."""
+    check_fetched(path)
     try:
         with path.open("rb") as file:
             yield make_reader(file)
     except DataError:
         raise
-    except (McapError, OSError, ValueError, KeyError, EOFError, StopIteration) as error:
+    except Exception as error:  # every compression has its own exceptions
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise DataError(f"the log {path} cannot be read ({reason})") from error
 

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import gymnasium
+import h5py
 import numpy as np
-from gymnasium.spaces import Box, Discrete, MultiBinary
+from gymnasium.spaces import Box, Discrete, MultiBinary, Text
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
+from minari.serialization import deserialize_space
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
-from acwm_core.files import parse_json
+from acwm_core.files import check_fetched, parse_json
 from acwm_formats.channels import Channels
 from acwm_formats.format import Format
-from acwm_formats.frames import ImageFrames, file_stamp, regular_times, stack_note
+from acwm_formats.frames import ImageFrames, Images, file_stamp, regular_times, stack_note
+from acwm_formats.hdf5_layouts import array, content
+from acwm_formats.hdf5_recordings import Place, StoredImages, rows, shared_file
 from acwm_formats.images import CHANNELS
-from acwm_formats.names import exact, pair, text_note, typed, word
+from acwm_formats.names import exact, natural, pair, text_note, typed, word
+from acwm_formats.sources import damage_of, files_in, guarded
+from acwm_formats.tables import MOST_COLUMNS
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 METADATA = "metadata.json"
@@ -32,8 +41,8 @@ SAME_COUNT = (
     "it has as many observations as steps, so its last action leads to no frame, unless each "
     "observation is the one after its action: then --shift -1 is right"
 )
-BROKEN = (OSError, ValueError, KeyError, TypeError, AssertionError, RuntimeError, IndexError)
-"""Exceptions of the library for files that are damaged."""
+MAIN = "main_data.hdf5"
+WHOLE = Place(Path(), "")
 
 
 class Minari(Format):
@@ -43,10 +52,11 @@ class Minari(Format):
     def detect(cls, path: Path) -> bool:
         """Whether there is the metadata of Minari, in the folder or in data below it."""
         try:
-            return OWN in parse_json((_data(path) / METADATA).read_bytes())
-        except (OSError, ValueError, TypeError):
+            return OWN in _metadata(path)
+        except DataError:
             return False
 
+    @guarded
     def read(
         self,
         root: Path,
@@ -55,6 +65,7 @@ class Minari(Format):
         rate: float | None = None,
         pixel_range: tuple[int, ...] | None = None,
         channels: Channels | None = None,
+        follow_links: bool = False,
     ) -> RecordedDataset:
         """Import a Minari dataset, whose observations are images or have some.
 
@@ -64,15 +75,17 @@ class Minari(Format):
             rate: Frames per second; by default those of the environment's spec, if it says them.
             pixel_range: Values that are black and white, e.g. 0,1.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
+            follow_links: Whether links may lead out of the folder; those within files may not.
         """
         root = Path(root)
-        storage, metadata = _storage(root), _metadata(root)
-        cameras = {name: s for name, s in _parts(storage.observation_space).items() if _shows(s)}
+        stored = _stored(root)
+        metadata, parts = stored.metadata, _parts(stored.observations)
+        cameras = {name: space for name, space in parts.items() if _shows(space)}
         if video is not None and video not in cameras:
             raise DataError(f"{root} has no images {video!r}{suggest(video, cameras)}")
         if not cameras:
             raise DataError(
-                f"the observations of {root} hold no image: {_parts(storage.observation_space)}"
+                f"the observations of {root} hold no image: {stored.observations!s:.200}"
             )
         said = exact(rate) if rate else _rate(metadata)
         if said is None:
@@ -83,10 +96,10 @@ class Minari(Format):
             name=word(root.parent if root.name == "data" else root),
             splits=recordings,
             facts={"kind": "minari", "name": str(metadata.get("dataset_id", root.name))}
-            | {"episodes": int(storage.total_episodes), "steps": int(storage.total_steps)},
+            | {"episodes": len(stored.episodes), "steps": int(metadata.get("total_steps", 0))},
             options={"video": video, "rate": rate, "pixel_range": typed(pixel_range)}
-            | {"channels": channels},
-            actions=_action(storage.action_space),
+            | {"channels": channels, "follow_links": follow_links},
+            actions=_action(stored.actions),
             notes=_notes(recordings, [name for name in cameras if name not in names]),
             summary=str(metadata.get("description") or "A dataset of Minari"),
         )
@@ -131,51 +144,43 @@ class MinariRecordings:
 
     def __len__(self) -> int:
         """The number of episodes."""
-        return int(_storage(self.root).total_episodes)
+        return len(_stored(self.root).episodes)
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode: the observations, and an action from each to the next."""
-        episode = _episode(self.root, index)
-        space = _storage(self.root).action_space
-        seen = _parts(episode["observations"])
-        cameras = {
-            name: ImageFrames(
-                StoredImages(self.root, index, name, len(seen[name])),
-                regular_times(len(seen[name]), self.rate),
-                self.pixel_range,
-                channels=self.channels,
-                stamp=f"{index} {name} {file_stamp(_data(self.root) / METADATA)}",
+        stored = _stored(self.root)
+        title = f"episode {stored.episodes[index].removeprefix('episode_')}"
+        with damage_of(f"{title} of {self.root}"):
+            read = _from_hdf5 if stored.kind == "hdf5" else _from_arrow
+            seen, taken = read(_data(self.root), stored, index)
+            cameras = {
+                name: self._frames(cast(Images, seen[name]), name, index) for name in self.cameras
+            }
+            states = {
+                name: Samples(values.reshape(len(values), -1))
+                for name, values in seen.items()
+                if isinstance(values, np.ndarray) and values.ndim <= 2
+            }
+            actions = Samples(_vectors(taken, stored.actions))
+            count = len(next(iter(cameras.values())).images)
+            notes = (SAME_COUNT,) if len(actions.values) == count else ()
+            return TimedRecording(
+                title, cameras, actions, states, self.rate, facts=_texts(seen), notes=notes
             )
-            for name in self.cameras
-        }
-        states = {
-            name: Samples(np.reshape(values, (len(values), -1)))
-            for name, values in seen.items()
-            if name not in self.cameras
-            and np.ndim(values) <= 2
-            and np.asarray(values).dtype.kind in "fiub"
-        }
-        actions = Samples(_vectors(episode["actions"], space))
-        count = len(next(iter(cameras.values())).images)
-        notes = (SAME_COUNT,) if len(actions.values) == count else ()
-        return TimedRecording(
-            f"episode {index}",
-            cameras,
-            actions,
-            states,
-            self.rate,
-            facts=_texts(seen),
-            notes=notes,
-        )
+
+    def _frames(self, images: Images, name: str, index: int) -> ImageFrames:
+        times = regular_times(len(images), self.rate)
+        stamp = f"{index} {name} {file_stamp(_data(self.root) / METADATA)}"
+        return ImageFrames(images, times, self.pixel_range, channels=self.channels, stamp=stamp)
 
 
 def _texts(seen: Mapping[str, Any]) -> dict[str, Any]:
     """Observed texts: one, or those that follow each other."""
     found: dict[str, Any] = {}
     for name, values in seen.items():
-        if np.asarray(values).dtype.kind in "UO" and all(isinstance(v, str) for v in values):
-            each = list(dict.fromkeys(map(str, values)))
-            found[name] = each[0] if len(each) == 1 else each
+        if isinstance(values, list) and all(isinstance(text, str) for text in values):
+            texts = list(dict.fromkeys(values))
+            found[name] = texts[0] if len(texts) == 1 else texts
     return found
 
 
@@ -188,20 +193,26 @@ def _notes(recordings: MinariRecordings, others: Sequence[str]) -> tuple[str, ..
     return tuple(notes)
 
 
-@dataclass(frozen=True)
-class StoredImages(Sequence[Any]):
-    """The images of one episode."""
+class _Stored(NamedTuple):
+    """What a dataset says about itself.
 
-    root: Path
-    episode: int
-    name: str
-    length: int
+    Attributes:
+        metadata: the content of its file of metadata.
+        kind: how its arrays are stored: hdf5, arrow or parquet.
+        observations, actions: their spaces.
+        episodes: their names, in natural order.
+    """
 
-    def __len__(self) -> int:
-        return self.length
+    metadata: Mapping[str, Any]
+    kind: str
+    observations: Any
+    actions: Any
+    episodes: tuple[str, ...]
 
-    def __getitem__(self, index: Any) -> Any:
-        return _parts(_episode(self.root, self.episode)["observations"])[self.name][index]
+
+_Seen = dict[str, NDArray[Any] | Images | list[str]]
+"""Observations of an episode by name; images may be files of pictures, which are read here, because
+the library hands them to whatever Pillow takes them for."""
 
 
 def _data(root: Path) -> Path:
@@ -209,52 +220,90 @@ def _data(root: Path) -> Path:
 
 
 def _metadata(root: Path) -> dict[str, Any]:
+    path = _data(root) / METADATA
+    check_fetched(path)
     try:
-        return parse_json((_data(root) / METADATA).read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{_data(root) / METADATA} cannot be read ({error})") from error
+        return dict(parse_json(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise DataError(f"{path} cannot be read ({error})") from error
 
 
-def _storage(root: Path) -> Any:
-    return _opened(root, file_stamp(_data(root) / METADATA))
+def _stored(root: Path) -> _Stored:
+    return _described(root, file_stamp(_data(root) / METADATA))
 
 
 @functools.lru_cache(maxsize=2)
-def _opened(root: Path, _: str) -> Any:
-    """The library's reader of the files.
+def _described(root: Path, _: str) -> _Stored:
+    """What a dataset says about itself.
 
     Raises:
-        DataError: they are damaged; or do not say the spaces, which the library would get by making
+        DataError: it is damaged; or does not say the spaces, which the library would get by making
             the environment that they name, and files are never code.
     """
-    metadata = _metadata(root)
+    metadata, data = _metadata(root), _data(root)
     if not {"observation_space", "action_space"} <= set(metadata):
         raise DataError(f"{root} does not say its spaces: write it again with a recent Minari")
-    try:
-        return MinariStorage.read(_data(root).absolute())
-    except BROKEN as error:
-        raise DataError(f"{root} is no Minari dataset that can be read ({error})") from error
+    kind = metadata.get("data_format", "hdf5")
+    if kind not in ("hdf5", "arrow", "parquet"):
+        raise DataError(f"{root} stores its arrays as {kind!r:.40}, not as hdf5, arrow or parquet")
+    with damage_of(data / METADATA):
+        seen = deserialize_space(metadata["observation_space"])
+        acts = deserialize_space(metadata["action_space"])
+        claimed = int(metadata["total_episodes"])
+    names = [*shared_file(data / MAIN)] if kind == "hdf5" else [p.name for p in data.iterdir()]
+    pattern = r"episode_\d+" if kind == "hdf5" else r"\d+"
+    there = sorted((name for name in names if re.fullmatch(pattern, name)), key=natural)
+    last = int(there[-1].removeprefix("episode_")) if there else -1
+    if claimed not in (len(there), last + 1):  # which differ if some were removed
+        many = f"{claimed:,} episodes, and {len(there):,} are there"
+        raise DataError(f"{data / METADATA} claims {many}")
+    return _Stored(metadata, kind, seen, acts, tuple(there))
 
 
-def _episode(root: Path, index: int) -> dict[str, Any]:
-    return _loaded(_storage(root), index)
+def _from_hdf5(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:
+    """Observations and actions of an episode; images are read when they are asked for."""
+    path = data / MAIN
+    group = shared_file(path)[stored.episodes[index]]
+    is_dict, seen = isinstance(stored.observations, gymnasium.spaces.Dict), _Seen()
+    for name, space in _parts(stored.observations).items():
+        where = f"observations/{name}" if is_dict else "observations"
+        if _shows(space):
+            seen[name] = StoredImages(path, f"{group.name}/{where}", len(array(group, where)))
+        elif isinstance(space, Text):
+            seen[name] = [bytes(text).decode() for text in content(array(group, where))]
+        elif isinstance(group.get(where), h5py.Dataset) and group[where].dtype.kind in "fiub":
+            seen[name] = rows(array(group, where), WHOLE)
+    return seen, rows(array(group, "actions"), WHOLE)
 
 
-@functools.lru_cache(maxsize=2)
-def _loaded(storage: Any, index: int) -> dict[str, Any]:
-    """The library reads an episode as a whole; it is kept for its frames."""
-    try:
-        (episode,) = storage.get_episodes([index])
-    except BROKEN as error:
-        raise DataError(f"episode {index} cannot be read ({error})") from error
-    return episode
+def _from_arrow(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:
+    """Observations and actions of an episode, which is a folder of files; the last row has none."""
+    dataset: Any = importlib.import_module("pyarrow.dataset")
+    files = [str(path) for path in files_in(data / stored.episodes[index], [f".{stored.kind}"])]
+    for path in files:
+        check_fetched(Path(path))
+    table = dataset.dataset(files, format=stored.kind).to_table(["observations", "actions"])
+    column = table.column("observations").combine_chunks()
+    is_dict, seen = isinstance(stored.observations, gymnasium.spaces.Dict), _Seen()
+    for name, space in _parts(stored.observations).items():
+        if isinstance(space, Box | Discrete | MultiBinary | Text):
+            seen[name] = _unpacked(column.field(name) if is_dict else column, space)
+    actions = _unpacked(table.column("actions").combine_chunks(), stored.actions)
+    return seen, np.asarray(actions)[:-1]
+
+
+def _unpacked(values: Any, space: Any) -> NDArray[Any] | list[bytes] | list[str]:
+    """The rows of an Arrow array: texts, files of pictures, or numbers in the space's shape."""
+    if str(values.type).endswith(("binary", "string")):
+        return values.to_pylist()
+    flat = values.flatten() if str(values.type).startswith("fixed_size_list") else values
+    return flat.to_numpy(zero_copy_only=False).reshape(-1, *space.shape)
 
 
 def _parts(observed: Any) -> dict[str, Any]:
-    """The entries of a dict of observations or spaces, or the only one."""
-    if isinstance(observed, gymnasium.spaces.Dict):
-        return dict(observed.spaces)
-    return dict(observed) if isinstance(observed, dict) else {"observation": observed}
+    """The spaces of a dict of observations, or the only one."""
+    is_dict = isinstance(observed, gymnasium.spaces.Dict)
+    return dict(observed.spaces) if is_dict else {"observation": observed}
 
 
 def _shows(space: Any) -> bool:
@@ -262,7 +311,7 @@ def _shows(space: Any) -> bool:
     return len(shape) == 3 and (shape[0] in CHANNELS or shape[2] in CHANNELS)
 
 
-def _rate(metadata: dict[str, Any]) -> Fraction | None:
+def _rate(metadata: Mapping[str, Any]) -> Fraction | None:
     try:
         spec = parse_json(metadata["env_spec"])
         return exact(float(spec["kwargs"]["render_fps"]))
@@ -271,6 +320,9 @@ def _rate(metadata: dict[str, Any]) -> Fraction | None:
 
 
 def _action(space: Any) -> ActionFacts:
+    wide = space.n if isinstance(space, Discrete) else math.prod(space.shape or ())
+    if wide > MOST_COLUMNS:
+        raise DataError(f"its actions are {wide:,} numbers, and {MOST_COLUMNS:,} are read at most")
     if isinstance(space, Discrete):
         count, start = int(space.n), int(space.start)
         names = tuple(f"action_{start + place}" for place in range(count))

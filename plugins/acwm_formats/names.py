@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
+import unicodedata
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
+from acwm_core.errors import DataError
 from acwm_core.plugins import catalog
 
 
@@ -14,6 +17,16 @@ def natural(name: str) -> list[tuple[int, str]]:
     """A key to sort names by, so that 2 comes before 10."""
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def folded(name: str) -> str:
+    """A name without its case, and with composed letters: macOS writes ü as two characters."""
+    return composed(name).casefold()
+
+
+def composed(name: str) -> str:
+    """A name in Unicode's NFC, in which equal names are equal."""
+    return unicodedata.normalize("NFC", name)
 
 
 def word(path: Path) -> str:
@@ -41,7 +54,13 @@ def words(text: str | None) -> tuple[str, ...]:
 
 
 def exact(rate: float) -> Fraction:
-    """A rate that was typed as a decimal; 29.97, 59.94 and the like are of NTSC."""
+    """A rate that was typed as a decimal; 29.97, 59.94 and the like are of NTSC.
+
+    Raises:
+        DataError: it is no number above 0.
+    """
+    if not 0 < rate < math.inf:
+        raise DataError(f"a rate of {rate} frames per second: give a number above 0")
     for whole in (24, 30, 48, 60, 120):
         ntsc = Fraction(whole * 1000, 1001)
         if abs(rate - ntsc) < 0.005:
@@ -50,8 +69,16 @@ def exact(rate: float) -> Fraction:
 
 
 def pair(numbers: tuple[int, ...] | None) -> tuple[float, float] | None:
-    """Two numbers that were typed, as a range."""
-    return None if numbers is None else (float(numbers[0]), float(numbers[1]))
+    """Two numbers that were typed, as a range.
+
+    Raises:
+        DataError: they are not two, or the second is not the greater one.
+    """
+    if numbers is None:
+        return None
+    if len(numbers) != 2 or not numbers[0] < numbers[1]:
+        raise DataError(f"--pixel-range {typed(numbers)}: give the values of black and of white")
+    return float(numbers[0]), float(numbers[1])
 
 
 def typed(numbers: tuple[int, ...] | None) -> str | None:

@@ -33,6 +33,7 @@ from acwm_formats.published_layout import (
     Entry,
     read_entries,
 )
+from acwm_formats.sources import files_in, guarded
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 LARGE = 1024  # square videos of this side are averaged down to `USUAL` by default
@@ -53,7 +54,10 @@ class Published(Format):
             for place in path.glob(f"{below}{name}")
         )
 
-    def read(self, root: Path) -> RecordedDataset | dict[str, RecordedDataset]:
+    @guarded
+    def read(
+        self, root: Path, *, follow_links: bool = False
+    ) -> RecordedDataset | dict[str, RecordedDataset]:
         """Import the published ACWM-Phys release.
 
         ROOT is the folder of one environment, which becomes the dataset OUT, or a folder of several
@@ -63,13 +67,14 @@ class Published(Format):
         Args:
             root: the folder of one environment, with some of ``ind_train``, ``ind_test`` and
                 ``ood_test`` in it, or a folder one or two levels above.
+            follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
         if _splits(root):
-            return _dataset(root)
+            return _dataset(root, follow_links)
         found: dict[str, RecordedDataset] = {}
         for folder in _folders(root):
-            dataset = _dataset(folder)
+            dataset = _dataset(folder, follow_links)
             name = dataset.name
             if name in found:
                 raise DataError(f"{folder} is a second {name}: import one folder at a time")
@@ -114,7 +119,7 @@ class Published(Format):
         return {"root": exported_example(folder, cls())}
 
 
-def _dataset(folder: Path) -> RecordedDataset:
+def _dataset(folder: Path, follow_links: bool) -> RecordedDataset:
     """The dataset of one environment."""
     places = _splits(folder)
     entries: dict[Split, list[Entry]] = {s: read_entries(places[s] / METADATA) for s in places}
@@ -130,7 +135,7 @@ def _dataset(folder: Path) -> RecordedDataset:
             "name": name,
             "sha256": {split: _sha256(place / METADATA) for split, place in places.items()},
         },
-        options={},
+        options={"follow_links": follow_links},
         actions=meaning.actions,
         size=USUAL if _side(first) == (LARGE, LARGE) else None,
         notes=(*meaning.notes, *_notes(places, entries)),
@@ -257,7 +262,8 @@ def _notes(places: Mapping[Split, Path], entries: Mapping[Split, list[Entry]]) -
         pieces = len(list(place.glob(PARTS)))
         if pieces:
             notes.append(f"{split}: {pieces} pieces of metadata left aside for the aggregate")
-        unlisted = {path.name for path in place.glob("*.mp4")} - {e.video for e in entries[split]}
+        videos = {path.name for path in files_in(place, [".mp4"])}
+        unlisted = videos - {entry.video for entry in entries[split]}
         if unlisted:
             notes.append(f"{split}: {len(unlisted)} videos are not in the metadata, left aside")
     return notes

@@ -7,18 +7,22 @@ until it is read. A file is replaced as a whole, so that nothing half fetched is
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import inspect
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from acwm_core.data import remote
-from acwm_core.errors import DataError
-from acwm_core.files import OF_THE_DISK, alone, inside, written_whole
+from acwm_core.errors import AcwmError, DataError
+from acwm_core.files import OF_THE_DISK, alone, check_tree, inside, written_whole
+from acwm_formats.names import natural
 
 AT_ONCE = 8  # files
 VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".gif")
@@ -26,6 +30,51 @@ LISTING = "listing.json"
 
 Marks = dict[str, list[str]]
 """What tells each file's content apart, by its path below the URL; "" for the URL itself."""
+
+
+def guarded(read: Callable[..., Any]) -> Any:
+    """Make a `Format.read` check what lies in its first argument before it reads it.
+
+    Links that lead out of it are refused unless the option `follow_links` allows them; all errors
+    of damaged files become a `DataError`.
+    """
+
+    @functools.wraps(read)
+    def guarded_read(self: Any, root: Path, **options: Any) -> Any:
+        inspect.signature(read).bind(self, root, **options)  # a misspelt option is no damage
+        follow = options.get("follow_links", False)
+        check_tree(Path(root), follow_links=follow, advice="give --follow-links to read it")
+        with damage_of(root):
+            return read(self, root, **options)
+
+    return guarded_read
+
+
+@contextlib.contextmanager
+def damage_of(path: str | Path) -> Generator[None]:
+    """Turn all errors that a damaged or forged file causes in the block into a `DataError`."""
+    try:
+        yield
+    except (AcwmError, NameError):  # which no file causes
+        raise
+    except Exception as error:  # every library has its own exceptions
+        why = " ".join(str(error).split())[:200]
+        what = f"{type(error).__name__}: {why}".removesuffix(": ")
+        raise DataError(f"{path} cannot be read: it is damaged, or forged ({what})") from error
+
+
+def files_in(folder: Path, endings: Iterable[str]) -> list[Path]:
+    """The files or folders with one of some endings, in natural order.
+
+    Hidden ones are left out: macOS puts a ``._take.mp4`` beside ``take.mp4`` on other disks.
+    """
+    known = tuple(endings)
+    paths = [
+        path
+        for path in folder.iterdir()
+        if path.name.lower().endswith(known) and not path.name.startswith(".")
+    ]
+    return sorted(paths, key=lambda path: natural(path.name))
 
 
 def is_url(source: str) -> bool:
@@ -44,6 +93,8 @@ def fetched(url: str, *, progress: bool = True) -> Path:
         MissingExtraError: the package for this kind of URL is not installed.
     """
     url = url.rstrip("/")
+    if url.startswith("file://"):  # whose links are looked at where it is
+        return Path(unquote(urlsplit(url).path))
     marks = _listed(url)
     digest = hashlib.sha256(json.dumps([url, sorted(marks.items())]).encode()).hexdigest()[:16]
     place = _imports() / digest / PurePosixPath(url).name

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
 import json
 import re
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -13,9 +13,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from acwm_core.arrays import check_unpacked, load_npy, load_npz
 from acwm_core.errors import DataError, suggest
-from acwm_core.files import parse_json
+from acwm_core.files import check_fetched, parse_json
 from acwm_formats.episode_bounds import NUMBERS, bounds_of, divides, plain
+from acwm_formats.names import composed
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 
@@ -34,29 +36,47 @@ EPISODES = ("video", "file", "filename")
 EPISODE = "episode"
 """Names of columns that are no actions, without the unit at their end."""
 
+MOST_COLUMNS = 4096
+"""Columns of a table. One with more has its frames side by side instead of one below the other."""
+
+DELIMITERS = (b",", b";", b"\t")
+
+ENCODINGS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+"""Encodings by the bytes that a text begins with."""
+
 
 def read_table(path: Path) -> Table:
     """Read the columns of a table; a column without a name that counts the rows is left out.
 
     Raises:
-        DataError: the file is missing, damaged, empty, ragged, or does not name its columns.
+        DataError: the file is missing, damaged, empty, ragged, too wide, or does not name its
+            columns.
     """
+    check_fetched(path)
+    columns: dict[str, NDArray[Any]] = {}
     try:
         rows = READERS[path.suffix.lower()](path)
+        _check_width(len(rows))
+        for name, values in _numbered(rows, path).items():
+            split = _split(composed(name), values)
+            if twice := next((column for column in split if column in columns), None):
+                raise DataError(f"{path} has two columns called {twice}: give them other names")
+            columns |= split
+            _check_width(len(columns))
     except FileNotFoundError:
         raise DataError(f"there is no {path}") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, arrow.ArrowException) as e:
-        reason = " ".join(str(e).split())[:200] or type(e).__name__
-        raise DataError(f"the table {path} cannot be read ({reason})") from e
-    columns: dict[str, NDArray[Any]] = {}
-    for name, values in _numbered(rows, path).items():
-        split = _split(name, values)
-        if twice := next((each for each in split if each in columns), None):
-            raise DataError(f"{path} has two columns called {twice}: give them other names")
-        columns |= split
+    except (*DAMAGED, arrow.ArrowException) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DataError(f"the table {path} cannot be read ({reason})") from error
     if len({len(values) for values in columns.values()}) > 1:
         lengths = {name: len(values) for name, values in columns.items()}
-        raise DataError(f"the columns of {path} differ in length: {lengths}")
+        raise DataError(f"the columns of {path} differ in length: {lengths!s:.300}")
     if not any(map(len, columns.values())):
         raise DataError(f"the table {path} holds no row")
     if "" in columns and not _counts(columns[""]):
@@ -69,6 +89,13 @@ def _counts(column: NDArray[Any]) -> bool:
     if column.dtype.kind not in "iu" or not len(column):
         return False
     return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
+
+
+def _check_width(count: int) -> None:
+    if count > MOST_COLUMNS:
+        raise ValueError(
+            f"it has {count:,} columns, and {MOST_COLUMNS:,} are read at most: a row is a moment"
+        )
 
 
 def numbers(table: Table, names: Sequence[str], path: Path) -> NDArray[np.float64]:
@@ -87,7 +114,7 @@ def number_column(table: Table, name: str, path: Path) -> NDArray[np.float64]:
     column = table[name]
     if column.dtype.kind not in "fiub":
         example = next((value for value in column.tolist() if not _is_number(value)), None)
-        raise DataError(f"the column {name} of {path} holds {example!r}, which is not a number")
+        raise DataError(f"the column {name} of {path} holds {example!r:.80}, which is not a number")
     values = column.astype(np.float64)
     if len(bad := np.flatnonzero(~np.isfinite(values))):
         raise DataError(
@@ -107,7 +134,7 @@ def holds_numbers(column: NDArray[Any]) -> bool:
 def _is_number(value: Any) -> bool:
     try:
         float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return True
 
@@ -175,23 +202,60 @@ def _split(name: str, values: Any) -> dict[str, NDArray[Any]]:
     if array.ndim == 1:
         return {name: array}
     if array.ndim != 2:
-        raise DataError(f"{name or 'the array'} is {array.shape}: a table has one or two axes")
+        raise ValueError(f"{name or 'the array'} is {array.shape}: a table has one or two axes")
+    _check_width(array.shape[1])
     base = name or "action"
     return {f"{base}_{place}": array[:, place] for place in range(array.shape[1])}
 
 
 def _csv(path: Path) -> dict[str, Any]:
     csv: Any = importlib.import_module("pyarrow.csv")
-    with path.open("rb") as file:
-        head = file.readline()
+    data, delimiter = _without_comments(_utf8(path.read_bytes()))
+    head = re.split(rb"[\r\n]", data, maxsplit=1)[0]
+    _check_width(head.count(delimiter) + 1)
     _check_head(head)
-    delimiter = max((",", ";", "\t"), key=lambda each: head.count(each.encode()))
-    kept = csv.ConvertOptions(strings_can_be_null=True)
-    with path.open("rb") as file:
-        table = csv.read_csv(
-            file, parse_options=csv.ParseOptions(delimiter=delimiter), convert_options=kept
-        )
+    table = csv.read_csv(
+        arrow.BufferReader(data),
+        parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
+        convert_options=csv.ConvertOptions(strings_can_be_null=True),
+    )
     return _columns(table)
+
+
+def _utf8(data: bytes) -> bytes:
+    """A text in UTF-8 without a mark, told by its first bytes; UTF-16 is what Excel writes."""
+    for mark, encoding in ENCODINGS.items():
+        if data.startswith(mark):
+            return data.decode(encoding).encode()
+    if b"\0" in data[:2]:
+        return data.decode("utf-16-be" if data[:1] == b"\0" else "utf-16-le").encode()
+    return data
+
+
+def _without_comments(data: bytes) -> tuple[bytes, bytes]:
+    """The lines of a CSV file but for comments, and its delimiter.
+
+    A comment begins with #, and has other fields than the header. The last one before the numbers
+    is the header if it has as many fields as they, as `numpy.savetxt` writes it.
+    """
+    data = data.lstrip(b"\r\n")
+    separator = data[4:5] if data[:4].lower() == b"sep=" else b""  # a first line for Excel
+    if not separator and not re.search(rb"(^|[\r\n])#", data):
+        return data, max(DELIMITERS, key=re.split(rb"[\r\n]", data, maxsplit=1)[0].count)
+    lines, comments = data.splitlines(), list[bytes]()
+    if separator:
+        lines.pop(0)
+    while lines and (lines[0].startswith(b"#") or not lines[0].strip()):
+        comments.append(lines.pop(0).lstrip(b"# "))
+    if not lines:
+        return data, b","
+    delimiter = separator or max(DELIMITERS, key=lines[0].count)
+    count = lines[0].count(delimiter)
+    header = next((comment for comment in reversed(comments) if comment.strip()), b"")
+    if header.count(delimiter) == count and all(map(_is_number, lines[0].split(delimiter))):
+        lines.insert(0, header)
+    kept = (line for line in lines if line[:1] != b"#" or line.count(delimiter) == count)
+    return b"\n".join(kept), delimiter
 
 
 def _check_head(head: bytes) -> None:
@@ -206,13 +270,25 @@ def _check_head(head: bytes) -> None:
 
 
 def _parquet(path: Path) -> dict[str, Any]:
+    with parquet_file(path) as file:
+        return _columns(file.read())
+
+
+def parquet_file(path: Path) -> Any:
+    """A Parquet file, whose columns unpack to no more than they may.
+
+    Raises:
+        ValueError: they would unpack to far more than is stored; or it is no such file.
+        OSError: it cannot be read.
+    """
     parquet: Any = importlib.import_module("pyarrow.parquet")
-    with path.open("rb") as file:
-        names = parquet.read_schema(file).names
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"it has two columns called {twice}: name them apart")
-    with path.open("rb") as file:
-        return _columns(parquet.read_table(file))
+    file = parquet.ParquetFile(path)
+    about = file.metadata
+    _check_width(about.num_columns)
+    groups = [about.row_group(place) for place in range(about.num_row_groups)]
+    values = sum(g.column(place).num_values for g in groups for place in range(g.num_columns))
+    check_unpacked(path.stat().st_size, 8 * max(values, about.num_rows * about.num_columns))
+    return file
 
 
 def _columns(table: Any) -> dict[str, Any]:
@@ -232,12 +308,11 @@ def _columns(table: Any) -> dict[str, Any]:
 
 
 def _npy(path: Path) -> dict[str, Any]:
-    return {"": np.load(path, allow_pickle=False)}
+    return {"": load_npy(path)}
 
 
 def _npz(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return dict(load_npz(path))
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -245,7 +320,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _jsonl(path: Path) -> dict[str, Any]:
-    lines = path.read_bytes().splitlines()
+    lines = _utf8(path.read_bytes()).splitlines()
     return _records([_parsed(line) for line in lines if line.strip()])
 
 
@@ -256,10 +331,12 @@ def _parsed(data: bytes) -> Any:
 
 
 def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise ValueError(f"it has two columns called {twice}: name them apart")
-    return dict(pairs)
+    entries = dict[str, Any]()
+    for name, value in pairs:
+        if name in entries:
+            raise ValueError(f"it has two columns called {name}: name them apart")
+        entries[name] = value
+    return entries
 
 
 def _records(value: Any) -> dict[str, Any]:
@@ -281,6 +358,12 @@ def _records(value: Any) -> dict[str, Any]:
 def _nan(value: Any) -> Any:
     return float("nan") if value is None else value
 
+
+DAMAGED = (
+    *(OSError, ValueError, LookupError, EOFError, TypeError, ArithmeticError, MemoryError),
+    RuntimeError,
+)
+"""What reading a damaged table raises."""
 
 READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".csv": _csv,

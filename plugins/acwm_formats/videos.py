@@ -16,8 +16,8 @@ from acwm_core.errors import DataError, suggest
 from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
-from acwm_formats.names import exact, is_action, natural, text_note, word, words
-from acwm_formats.sources import VIDEOS
+from acwm_formats.names import composed, exact, folded, is_action, text_note, word, words
+from acwm_formats.sources import VIDEOS, damage_of, files_in, guarded
 from acwm_formats.tables import (
     FRAMES,
     READERS,
@@ -94,8 +94,9 @@ class Videos(Format):
         if not path.is_dir():
             return False
         places = find_places(path)
-        return bool(places) and (any(place.table for place in places) or bool(_tables(path)))
+        return bool(places) and bool(files_in(path, READERS) or any(p.table for p in places))
 
+    @guarded
     def read(
         self,
         root: Path,
@@ -106,6 +107,7 @@ class Videos(Format):
         time: str | None = None,
         rate: float | None = None,
         from_first_row: bool = False,
+        follow_links: bool = False,
     ) -> RecordedDataset:
         """Import a folder of videos, one episode each, with actions in a table beside each.
 
@@ -127,6 +129,7 @@ class Videos(Format):
             rate: Frames per second of folders of pictures.
             from_first_row: Whether the first row was taken with the first frame, if the clocks of
                 table and video differ.
+            follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
         places = find_places(root, actions)
@@ -138,9 +141,10 @@ class Videos(Format):
             endings = ", ".join(ending[1:] for ending in READERS)
             raise DataError(f"{root} has no table of actions beside {places[0].name}: {endings}")
         path = first_sound(tables, read_table)
-        chosen = _columns(path, words(columns), words(states), time, shared=table is not None)
+        acting, kept = (tuple(map(composed, words(names))) for names in (columns, states))
+        chosen = _columns(path, acting, kept, time and composed(time), shared=table is not None)
         options = {"actions": actions, "columns": columns, "states": states, "time": time}
-        options |= {"rate": rate, "from_first_row": from_first_row}
+        options |= {"rate": rate, "from_first_row": from_first_row, "follow_links": follow_links}
         return RecordedDataset(
             name=word(root),
             splits=VideoFolder(
@@ -191,6 +195,10 @@ class VideoFolder:
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
         place = self.places[index]
+        with damage_of(self.table or place.table or Path(place.name)):
+            return self._opened(place, index)
+
+    def _opened(self, place: Place, index: int) -> TimedRecording:
         rows, path = self._rows(place, index)
         times = None
         if self.columns.time:
@@ -273,29 +281,56 @@ class VideoFolder:
 
 
 def find_places(root: Path, actions: str | None = None) -> list[Place]:
-    """The episodes in a folder, in natural order: 2 comes before 10."""
+    """The episodes in a folder, in natural order: 2 comes before 10.
+
+    Raises:
+        DataError: several tables have the name of a video, but for the case of letters.
+    """
     found: list[Place] = []
-    for path in sorted(root.iterdir(), key=_order):
-        if path.name.startswith((".", "_")):
+    beside = _Tables(files_in(root, READERS))
+    for path in files_in(root, [""]):
+        if path.name.startswith("_"):
             continue
         if path.suffix.lower() in VIDEOS and path.is_file():
-            tables = _tables_of(root, path.stem)
-            found.append(_tabled(path.stem, {"video": path}, tables))
+            found.append(_tabled(path.stem, {"video": path}, beside.of(path.stem)))
         elif path.is_dir():
-            found += _folder(root, path, actions)
+            found += _folder(path, actions, beside)
     return found or _grouped(root, None)
 
 
-def _folder(root: Path, folder: Path, actions: str | None) -> list[Place]:
+class _Tables:
+    """Tables by the names of their files, whose case and way of composing letters may differ."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths: dict[str, list[Path]] = {}
+        for path in paths:
+            self._paths.setdefault(folded(path.stem), []).append(path)
+
+    def of(self, stem: str) -> list[Path]:
+        """The tables of the episode with this name, which has one at best."""
+        same = self._paths.get(folded(stem), [])
+        same = [path for path in same if composed(path.stem) == composed(stem)] or same
+        if len({path.stem for path in same}) > 1:
+            names = " and ".join(path.name for path in same)
+            raise DataError(f"{names} could both be the table of {stem}: rename one")
+        endings = [*READERS]
+        return sorted(same, key=lambda path: endings.index(path.suffix.lower()))
+
+
+def _folder(folder: Path, actions: str | None, beside: _Tables) -> list[Place]:
     """The episode that a folder is: pictures, or a video or folder of pictures per camera."""
-    inner = [path for path in _tables(folder) if actions is None or path.name == actions]
-    tables = inner or _tables_of(root, folder.name)
+    inner = [
+        path
+        for path in files_in(folder, READERS)
+        if actions is None or folded(path.name) == folded(actions)
+    ]
+    tables = inner or beside.of(folder.name)
     if _pictures(folder):
         several = _grouped(folder, tables[0] if len(tables) == 1 else None)
         return several or [_tabled(folder.name, {"video": folder}, tables)]
     cameras = {
         path.stem if path.is_file() else path.name: path
-        for path in sorted(folder.iterdir(), key=_order)
+        for path in files_in(folder, [""])
         if path.suffix.lower() in VIDEOS or (path.is_dir() and _pictures(path))
     }
     return [_tabled(folder.name, cameras, tables)] if cameras else []
@@ -342,34 +377,21 @@ def _title(begins: str) -> str:
     return re.sub(r"\D+$", "", begins)
 
 
-def _order(path: Path) -> list[tuple[int, str]]:
-    return natural(path.name)
-
-
 def _pictures(folder: Path) -> list[Path]:
-    found = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return sorted(found, key=_order)
-
-
-def _tables(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in READERS)
-
-
-def _tables_of(root: Path, stem: str) -> list[Path]:
-    paths = (root / f"{stem}{ending}" for ending in READERS)
-    return [path for path in paths if path.is_file()]
+    return files_in(folder, PICTURES)
 
 
 def _shared(root: Path, places: Sequence[Place], actions: str | None) -> Path | None:
     """The table for all episodes, if there is one."""
-    if actions and (root / actions).is_file():
-        return root / actions
+    tables = files_in(root, READERS)
+    named = [path for path in tables if actions and folded(path.name) == folded(actions)]
+    if named:
+        return named[0]
     own = {place.table for place in places}
     if len(places) > 1 and len(own) == 1 and None not in own:
         return own.pop()  # of a folder with the pictures of all
     if any(place.table or place.tables for place in places):
         return None
-    tables = _tables(root)
     if len(tables) > 1:
         names = ", ".join(path.name for path in tables)
         raise DataError(f"{root} has several tables ({names}): give --actions NAME")
@@ -395,7 +417,10 @@ def _rows_of(table: Table, column: str, index: int, place: Place, count: int, pa
         chosen = values == index
     else:
         files = {place.name, *(source.name for source in place.cameras.values())}
-        chosen = np.array([str(value) in files for value in values])
+        names = [composed(str(value)) for value in values]
+        chosen = np.array([name in {*map(composed, files)} for name in names])
+        if not chosen.any():
+            chosen = np.array([folded(name) in {*map(folded, files)} for name in names])
     if not chosen.any():
         raise DataError(f"{path} has no row of {place.name} in the column {column}")
     return {name: rows[chosen] for name, rows in table.items()}
@@ -451,11 +476,12 @@ def _notes(root: Path, places: Sequence[Place], path: Path, chosen: Columns) -> 
     if chosen.time is None and chosen.frame is None:
         notes.append("Rows belong to frames by their place: the tables have no column of times.")
     used = {place.table for place in places} | {path}
-    if lone := [table.name for table in _tables(root) if table not in used]:
+    if lone := [table.name for table in files_in(root, READERS) if table not in used]:
         notes.append(f"Tables without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
     if chosen.episode and (names := read_table(path)[chosen.episode]).dtype.kind not in "iuf":
         films = {n for p in places for n in (p.name, *(each.name for each in p.cameras.values()))}
-        if lone := sorted({str(name) for name in names.tolist()} - films):
+        known = {folded(film) for film in films}
+        if lone := sorted({n for n in map(str, names.tolist()) if folded(n) not in known}):
             notes.append(f"Rows without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
     if unread := _unread(root, places, used):
         notes.append(
@@ -470,9 +496,9 @@ def _unread(root: Path, places: Sequence[Place], tables: set[Path | None]) -> li
     used |= {path.parent for path in used if path and path.parent != root}
     return [
         path.name
-        for path in sorted(root.iterdir(), key=_order)
+        for path in files_in(root, [""])
         if path not in used
-        and not path.name.startswith((".", "_"))
+        and not path.name.startswith("_")
         and path.suffix.lower() not in READERS
         and not (root in used and path.suffix.lower() in PICTURES)
     ]

@@ -5,25 +5,29 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.errors import BaseZarrError
 from zarr.storage import ZipStore
 
+from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError, suggest
+from acwm_core.files import check_fetched
 from acwm_formats.channels import Channels
 from acwm_formats.episode_bounds import bounds_of, divides
 from acwm_formats.format import Format
-from acwm_formats.frames import ImageFrames, regular_times, stack_note
-from acwm_formats.images import CHANNELS
+from acwm_formats.frames import MOST_FRAMES, ImageFrames, regular_times, stack_note
+from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import exact, pair, typed, word, words
+from acwm_formats.sources import damage_of, guarded
 from acwm_formats.timeline import RecordedDataset, Samples, TimedRecording
 
 ENDS = "meta/episode_ends"
@@ -53,8 +57,7 @@ CODECS = (
 )
 """Codecs of numbers and images. Others are refused: those of objects run code as they read."""
 
-BROKEN = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, BaseZarrError)
-"""Exceptions of the library for what is damaged."""
+MOST_LOOKED_AT = 1000  # files
 
 
 class ZarrReplay(Format):
@@ -63,11 +66,12 @@ class ZarrReplay(Format):
     @classmethod
     def detect(cls, path: Path) -> bool:
         """Whether there is an array ``meta/episode_ends``, or it is called ``.zarr.zip``."""
-        if path.name.endswith(".zarr.zip"):
+        if path.name.lower().endswith(".zarr.zip"):
             return path.is_file()
         files = (".zarray", "zarr.json")
         return any((path / place / file).is_file() for place in PLACES for file in files)
 
+    @guarded
     def read(
         self,
         root: Path,
@@ -78,6 +82,7 @@ class ZarrReplay(Format):
         states: str | None = None,
         pixel_range: tuple[int, ...] | None = None,
         channels: Channels | None = None,
+        follow_links: bool = False,
     ) -> RecordedDataset:
         """Import a Zarr replay buffer with data/… of all episodes and meta/episode_ends.
 
@@ -91,6 +96,7 @@ class ZarrReplay(Format):
             states: Names of the states to keep; by default all other numbers.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
+            follow_links: Whether links may lead out of the folder.
         """
         buffer = Buffer(Path(root))
         names = [name for name in buffer.names() if not divides(name)]
@@ -122,7 +128,7 @@ class ZarrReplay(Format):
                 "episodes": len(buffer.ends),
                 "frames": buffer.ends[-1],
             },
-            options=options | {"pixel_range": typed(pixel_range)},
+            options=options | {"pixel_range": typed(pixel_range), "follow_links": follow_links},
             notes=_notes(recordings, [name for name in found if name not in used]),
             summary=f"The replay buffer {name}",
         )
@@ -158,6 +164,10 @@ class ZarrRecordings:
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
+        with damage_of(self.buffer.root):
+            return self._opened(index)
+
+    def _opened(self, index: int) -> TimedRecording:
         start, stop = [0, *self.buffer.ends][index : index + 2]
         times = regular_times(stop - start, self.rate)
 
@@ -213,21 +223,21 @@ class Buffer:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._found: dict[str, Any] = {}
-        try:
-            store: Any = ZipStore(root, mode="r") if root.is_file() else str(root)
+        with damage_of(root), _pointers_named(root):
+            if root.is_file():
+                with ZipFile(root) as packed:
+                    sizes = (member.file_size for member in packed.infolist())
+                    check_unpacked(root.stat().st_size, sum(sizes))
+            store: Any = ZipStore(root, mode="r") if root.is_file() else str(root.absolute())
             self._group: Any = zarr.open_group(store, mode="r")
-        except (OSError, *BROKEN) as error:
-            raise DataError(f"{root} is no Zarr group that can be read ({error})") from error
 
     def __reduce__(self) -> Any:
         return Buffer, (self.root,)
 
     def names(self) -> list[str]:
         """The names of the arrays in ``data``."""
-        try:
+        with damage_of(self.root / "data"), _pointers_named(self.root / "data"):
             return sorted(name for name, _ in self._group["data"].arrays())
-        except (OSError, *BROKEN) as error:
-            raise DataError(f"{self.root} has no group data that can be read ({error})") from error
 
     def array(self, name: str) -> Any:
         """An array of numbers whose codecs run no code.
@@ -237,25 +247,29 @@ class Buffer:
         """
         if name in self._found:
             return self._found[name]
-        try:
+        with damage_of(self.root / name), _pointers_named(self.root / name):
             array = self._group[name]
             codecs = [*array.filters, *array.compressors]
             used = [getattr(codec, "codec_id", type(codec).__name__) for codec in codecs]
-        except (OSError, *BROKEN) as error:
-            raise DataError(
-                f"{self.root} has no array {name} that can be read ({error})"
-            ) from error
         if array.dtype.kind not in "fiub" or not {*used} <= {*CODECS}:
             raise DataError(f"{name} of {self.root} holds {array.dtype} by {used}, not numbers")
+        chunk = math.prod(array.chunks) * array.dtype.itemsize
+        if max(chunk / 2, math.prod(array.shape[1:]) * array.dtype.itemsize) > MOST_BYTES:
+            raise DataError(
+                f"{name} of {self.root} claims rows {list(array.shape[1:])} in chunks of {chunk:,} "
+                "bytes, more than are read"
+            )
         self._found[name] = array
         return array
 
     def rows(self, name: str, start: int, stop: int | None) -> NDArray[Any]:
         """Rows `start` to `stop` of an array."""
-        try:
-            return np.asarray(self.array(name)[start:stop])
-        except (OSError, *BROKEN) as error:
-            raise DataError(f"{name} of {self.root} cannot be read ({error})") from error
+        array = self.array(name)
+        count = (array.shape[0] if stop is None else stop) - start
+        if count * math.prod(array.shape[1:]) * array.dtype.itemsize > 4 * MOST_BYTES:
+            raise DataError(f"{name} of {self.root} claims {count:,} rows, more than are read")
+        with damage_of(f"{name} of {self.root}"), _pointers_named(self.root / name):
+            return np.asarray(array[start:stop])
 
     @functools.cached_property
     def ends(self) -> list[int]:
@@ -265,6 +279,8 @@ class Buffer:
             DataError: nothing says it, or what does contradicts itself.
         """
         place = next((each for each in PLACES if each in self._group), ENDS)
+        if (count := self.array(place).shape[0]) > MOST_FRAMES:
+            raise DataError(f"{place} of {self.root} claims {count:,} episodes")
         if place != ENDS and not place.endswith("episode_ends"):
             lengths = self.rows(place, 0, None)
             count, name = int(lengths.sum()), place.rpartition("/")[2]
@@ -274,6 +290,18 @@ class Buffer:
         if not ends or any(end <= start for start, end in itertools.pairwise([0, *ends])):
             raise DataError(f"{ENDS} of {self.root} does not grow with each episode: {ends[:5]}")
         return ends
+
+
+@contextlib.contextmanager
+def _pointers_named(root: Path) -> Generator[None]:
+    """Where the block fails, report a file that Git LFS has not fetched as the cause."""
+    try:
+        yield
+    except Exception:
+        for path in itertools.islice(root.rglob("*"), MOST_LOOKED_AT):
+            if path.is_file():
+                check_fetched(path)
+        raise
 
 
 def _shows(array: Any) -> bool:
