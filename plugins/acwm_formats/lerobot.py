@@ -16,23 +16,24 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import EnvironmentCard, StateField
 from acwm_core.env.episode import Split
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, suggest
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, video_index
 from acwm_formats.lerobot_export import Writer
 from acwm_formats.lerobot_layout import (
     ACTION,
+    COLUMNS,
     INFO,
     Place,
     arrow,
-    as_one_sentence,
     read_card,
     read_columns,
     read_info,
     read_places,
 )
-from acwm_formats.names import is_action, text_note, word
+from acwm_formats.names import is_action, text_note, word, words
+from acwm_formats.sources import damage_of, guarded
 from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
 
 FRAME, REWARD = "frame_index", "next.reward"
@@ -53,7 +54,10 @@ class LeRobot(Format):
         """Whether there is a ``meta/info.json``."""
         return (path / INFO).is_file()
 
-    def read(self, root: Path) -> RecordedDataset:
+    @guarded
+    def read(
+        self, root: Path, *, actions: str | None = None, follow_links: bool = False
+    ) -> RecordedDataset:
         """Import the LeRobot dataset in the folder ROOT, of version 3.0, 2.1 or 2.0.
 
         Imports the frames of one or several cameras, the actions and the observed numbers; tasks
@@ -63,29 +67,37 @@ class LeRobot(Format):
 
         Args:
             root: the dataset's folder, with `meta`, `data` and `videos` in it.
+            actions: Features that are the actions, joined in this order, e.g. arm,gripper; by
+                default action, or the only one that is called so.
+            follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
-        with as_one_sentence(root):
-            info = read_info(root)
-            features = cast(dict[str, dict[str, Any]], info["features"])
-            _check_features(features)
-            places = read_places(root)
-            if not places:
-                raise DataError(f"{root} holds no episodes")
-            ours = read_card(root)
-            name = ours.name if ours else ""
-            return RecordedDataset(
-                name or word(root),
-                LeRobotRecordings(root),
-                {"kind": "lerobot", "name": root.resolve().name, **_facts(root, places)},
-                fps=_rate(info, ours),
-                tests=_tests(info, len(places)),
-                options={},
-                actions=_action(features, ours),
-                state=tuple(_state(features)),
-                notes=() if ours else _notes(features, places),
-                summary=ours.summary if ours else f"{info.get('robot_type') or 'a robot'}",
-            )
+        info = read_info(root)
+        features = cast(dict[str, dict[str, Any]], info["features"])
+        if not _cameras(features):
+            raise DataError("the dataset has no camera, and a world model predicts video")
+        acting = _action_names(features, words(actions))
+        places = read_places(root)
+        if not places:
+            raise DataError(f"{root} holds no episodes")
+        ours = read_card(root)
+        name = ours.name if ours else ""
+        observed = [field for field in _state(features) if field.name not in acting]
+        empty = _empty(places[0], [field.name for field in observed])
+        state = tuple(field for field in observed if field.name not in empty)
+        unused = _unused(features, (*acting, *(field.name for field in observed)))
+        return RecordedDataset(
+            name or word(root),
+            LeRobotRecordings(root, acting, tuple(field.name for field in state)),
+            {"kind": "lerobot", "name": root.resolve().name, **_facts(root, places)},
+            fps=_rate(info, ours),
+            tests=_tests(info, places),
+            options={"actions": actions, "follow_links": follow_links},
+            actions=_action(features, acting, ours),
+            state=state,
+            notes=(*_notes(acting, unused, empty, places),) if not ours else (),
+            summary=ours.summary if ours else f"{info.get('robot_type') or 'a robot'}",
+        )
 
     def write(self, export: Export) -> None:
         """Write a LeRobot dataset of version 3.0 with one camera.
@@ -120,6 +132,8 @@ class LeRobotRecordings:
     """The episodes of a LeRobot dataset, opened on request."""
 
     root: Path
+    actions: tuple[str, ...]
+    states: tuple[str, ...]
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -127,17 +141,17 @@ class LeRobotRecordings:
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open an episode, without decoding its frames."""
-        with as_one_sentence(self.root):
+        with damage_of(self.root):
             return self._opened(index)
 
     def _opened(self, index: int) -> TimedRecording:
         whole = _index(self.root)
         place = whole.places[index]
-        states = [field.name for field in _state(whole.features)]
         rewards = [REWARD] if REWARD in whole.features else []
-        names = [FRAME, ACTION, *states, *rewards]
+        names = [FRAME, *self.actions, *self.states, *rewards]
         table = read_columns(place.data, names, place.episode)
         columns = {name: _numbers(table, name) for name in names}
+        actions = np.concatenate([columns[name] for name in self.actions], axis=1)
         numbers = columns[FRAME][:, 0].astype(np.int64)
         cameras = _Cameras(tuple(_cameras(whole.features)), index, self.root, numbers / whole.fps)
         facts: dict[str, Any] = {"episode": place.episode, "tasks": list(place.tasks)}
@@ -146,8 +160,8 @@ class LeRobotRecordings:
         return TimedRecording(
             f"episode {place.episode}",
             cameras,
-            Samples(columns[ACTION], frames=numbers),
-            {name: Samples(columns[name], frames=numbers) for name in states},
+            Samples(actions, frames=numbers),
+            {name: Samples(columns[name], frames=numbers) for name in self.states},
             rate=Fraction(whole.fps).limit_denominator(100_000),
             length=place.length,
             facts=facts,
@@ -176,7 +190,7 @@ class _Cameras(Mapping[str, Frames]):
         if name not in self.names:
             raise KeyError(name)
         if name not in self._looked_at:
-            with as_one_sentence(self.root):
+            with damage_of(self.root):
                 self._looked_at[name] = self._frames(name)
         return self._looked_at[name]
 
@@ -206,29 +220,35 @@ class _Index:
         """The episodes of each video, in their order there."""
         found: dict[tuple[str, Path], list[Place]] = {}
         for place in self.places:
-            for camera, (path, _) in place.videos.items():
-                found.setdefault((camera, path), []).append(place)
+            for camera, shown in place.videos.items():
+                found.setdefault((camera, shown.path), []).append(place)
         for (camera, _), inside in found.items():
-            inside.sort(key=lambda place: place.videos[camera][1])
+            inside.sort(key=lambda place: place.videos[camera].start)
         return found
 
     def video(self, index: int, camera: str) -> VideoFrames:
         """The frames of an episode in a video of one or many episodes.
 
-        They are counted if the file has as many as its episodes together, else told by time.
+        They are counted if the file has as many as its episodes together, else told by time: it may
+        have those of episodes that were removed.
         """
-        path, start = self.places[index].videos[camera]
+        path, start, end = self.places[index].videos[camera]
         inside = self._by_file[camera, path]
-        if len(inside) == 1 and start == 0:
+        alone = len(inside) == 1 and start == 0
+        if alone and end is None:
             return VideoFrames(path)
         times = video_index(path).times
+        half = 0.5 / self.fps
+        if alone and times[-1] < cast(float, end) - half:
+            return VideoFrames(path)
         at = [place.episode for place in inside].index(self.places[index].episode)
         before = sum(place.length for place in inside[:at])
         if sum(place.length for place in inside) == len(times):
             stop = before + self.places[index].length
             return VideoFrames(path, before, stop, float(times[before]))
-        edges = [*(place.videos[camera][1] for place in inside[at : at + 2]), np.inf][:2]
-        first, stop = np.searchsorted(times, np.array(edges) - 0.5 / self.fps).tolist()
+        ends = [place.videos[camera].start for place in inside[at + 1 : at + 2]]
+        edges = start, min([np.inf if end is None else end, *ends])
+        first, stop = np.searchsorted(times, np.array(edges) - half).tolist()
         return VideoFrames(path, first, stop, start)
 
 
@@ -268,6 +288,9 @@ class _RowImages:
 def _numbers(table: Any, name: str) -> NDArray[Any]:
     """A column as an array ``[T, …]``."""
     column, types = table.column(name).combine_chunks(), arrow.types
+    if column.null_count:
+        row = column.is_null().index(True).as_py()
+        raise DataError(f"{name} is null in row {row} (counted from 0)")
     try:
         if types.is_list(column.type) and not types.is_nested(column.type.value_type):
             (length,) = set(column.value_lengths().to_pylist())
@@ -287,37 +310,90 @@ def _cameras(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [name for name, f in features.items() if f.get("dtype") in ("video", "image")]
 
 
-def _check_features(features: Mapping[str, Mapping[str, Any]]) -> None:
-    if not _cameras(features):
-        raise DataError("the dataset has no camera, and a world model predicts video")
-    if ACTION not in features:
-        raise DataError("the dataset has no actions, and a world model is conditioned on them")
+def _action_names(
+    features: Mapping[str, Mapping[str, Any]], asked: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The features that are the actions: those asked for, or what is called so.
+
+    Raises:
+        DataError: there is none, or it has to be chosen.
+    """
+    numeric = [name for name, feature in features.items() if _is_numeric(feature)]
+    for name in asked:
+        if name not in numeric:
+            raise DataError(f"the dataset has no numbers {name!r}{suggest(name, numeric)}")
+    called = [name for name in numeric if is_action(name)]
+    if asked or ACTION in called:
+        return asked or (ACTION,)
+    if len(called) == 1:
+        return (called[0],)
+    if not called:
+        others = ", ".join(name for name in numeric if name not in COLUMNS)
+        raise DataError(
+            "the dataset has no feature action, and a world model is conditioned on actions: give "
+            f"--actions NAME, one or some of {others}"
+        )
+    raise DataError(
+        f"the dataset has {', '.join(called)}, and none called action: give --actions with those "
+        "to join, in their order"
+    )
 
 
-def _action(features: Mapping[str, Mapping[str, Any]], ours: EnvironmentCard | None) -> ActionFacts:
-    if ours:
+def _is_numeric(feature: Mapping[str, Any]) -> bool:
+    return re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype"))) is not None
+
+
+def _empty(place: Place, names: Sequence[str]) -> list[str]:
+    """The columns that are null throughout an episode; none if it cannot be read."""
+    try:
+        table = read_columns(place.data, list(names), place.episode)
+    except DataError:
+        return []  # opening the episode will tell why
+    return [name for name in names if len(table) and table.column(name).null_count == len(table)]
+
+
+def _unused(features: Mapping[str, Mapping[str, Any]], used: Sequence[str]) -> list[str]:
+    known = (*COLUMNS, *used, REWARD, *_cameras(features))
+    return [name for name in features if name not in known]
+
+
+def _notes(
+    acting: Sequence[str], unused: Sequence[str], empty: Sequence[str], places: Sequence[Place]
+) -> Iterator[str]:
+    """What people should know about how the dataset was read."""
+    if acting != (ACTION,):
+        yield f"Actions are {', '.join(acting)}."
+    yield "The units of actions are not known."
+    if unused:
+        yield f"Features that were left out: {', '.join(unused)}."
+    if empty:
+        yield f"Features that were left out, as they hold null: {', '.join(empty)}."
+    yield from text_note(["tasks"]) if any(place.tasks for place in places) else ()
+
+
+def _action(
+    features: Mapping[str, Mapping[str, Any]], acting: Sequence[str], ours: EnvironmentCard | None
+) -> ActionFacts:
+    if ours and tuple(acting) == (ACTION,):
         spec = ours.action
         return ActionFacts(spec.names, spec.units, spec.kind, (spec.low, spec.high))
-    names, shape = _names(features[ACTION]), features[ACTION].get("shape")
-    fits = isinstance(shape, list) and [len(names)] == shape
-    return ActionFacts(tuple(names) if fits else ())
-
-
-def _notes(features: Mapping[str, Any], places: Sequence[Place]) -> tuple[str, ...]:
-    """What people should know about how the dataset was read."""
-    notes = ["The units of actions are not known."]
-    if left := [name for name in features if is_action(name) and name != ACTION]:
-        notes.append(f"Features that were left out: {', '.join(left)}.")
-    return (*notes, *(text_note(["tasks"]) if any(place.tasks for place in places) else []))
+    names: list[str] = []
+    for name in acting:
+        own, shape = _names(features[name]), features[name].get("shape")
+        fits = isinstance(shape, list) and [len(own)] == shape
+        if not fits and len(acting) == 1:
+            return ActionFacts()
+        size = int(np.prod(cast(list[int], shape))) if isinstance(shape, list) else 1
+        names += own if fits else [f"{name}_{place}" for place in range(size)]
+    return ActionFacts(tuple(names))
 
 
 def _state(features: Mapping[str, Mapping[str, Any]]) -> list[StateField]:
     """The state fields: all observed numbers."""
     fields: list[StateField] = []
     for name, feature in features.items():
-        numeric = re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype")))
-        if name.startswith("observation.") and numeric:
-            shape = tuple(int(n) for n in feature.get("shape", ())) or (1,)
+        if name.startswith("observation.") and _is_numeric(feature):
+            shape = tuple(int(n) for n in feature.get("shape") or ()) or (1,)
             about = f"as recorded: {', '.join(_names(feature))}".rstrip(": ")
             fields.append(StateField(name, shape, "", about))
     return fields
@@ -340,14 +416,15 @@ def _names(feature: Mapping[str, Any]) -> list[str]:
     return list(strings(feature.get("names")))
 
 
-def _tests(info: Mapping[str, Any], episodes: int) -> dict[Split, Sequence[int]]:
+def _tests(info: Mapping[str, Any], places: Sequence[Place]) -> dict[Split, Sequence[int]]:
     """The test episodes that the dataset names."""
     tests: dict[Split, list[int]] = {}
     for name, text in cast(dict[str, Any], info.get("splits") or {}).items():
         found = re.fullmatch(r"(\d+):(\d+)", str(text))
         if found and name in TESTS:
+            first, stop = int(found[1]), int(found[2])
             tests.setdefault(TESTS[name], []).extend(
-                range(int(found[1]), min(int(found[2]), episodes))
+                index for index, place in enumerate(places) if first <= place.episode < stop
             )
     return {split: numbers for split, numbers in tests.items() if numbers}
 
@@ -355,7 +432,7 @@ def _tests(info: Mapping[str, Any], episodes: int) -> dict[Split, Sequence[int]]
 def _facts(root: Path, places: Sequence[Place]) -> dict[str, Any]:
     """Facts that identify this dataset without reading all of it."""
     digest = hashlib.sha256((root / INFO).read_bytes())
-    starts = [[start for _, start in place.videos.values()] for place in places]
+    starts = [[shown.start for shown in place.videos.values()] for place in places]
     lengths = [(place.episode, place.length) for place in places]
     digest.update(repr((lengths, starts)).encode())
     return {"sha256_of_meta": digest.hexdigest()}

@@ -9,17 +9,18 @@ videos/CAMERA/chunk-000/file-000.mp4         many episodes one after another
 
 from __future__ import annotations
 
-import contextlib
 import importlib
+import itertools
 import re
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from acwm_core.data.shards import UNREADABLE
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.errors import AcwmError, DataError
-from acwm_core.files import inside, parse_json
+from acwm_core.errors import DataError
+from acwm_core.files import check_fetched, parse_json
+from acwm_formats.tables import parquet_file
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -39,7 +40,19 @@ ACTION = "action"
 COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Columns of every row besides the recorded features."""
 
-MAX_BYTES = 2**26  # largest size of a JSON file
+
+class Shown(NamedTuple):
+    """Where the frames of an episode lie.
+
+    Attributes:
+        path: the video file.
+        start: at which second of it the episode starts.
+        end: and ends; None if that is not stated.
+    """
+
+    path: Path
+    start: float = 0.0
+    end: float | None = None
 
 
 class Place(NamedTuple):
@@ -49,15 +62,14 @@ class Place(NamedTuple):
         episode: number of the episode.
         length: number of its frames.
         data: the parquet file with its rows.
-        videos: for each camera whose frames are not in the rows, the file with its frames, and at
-            which second of it the episode starts.
+        videos: for each camera whose frames are not in the rows, where these are.
         tasks: what was to be done.
     """
 
     episode: int
     length: int
     data: Path
-    videos: dict[str, tuple[Path, float]]
+    videos: dict[str, Shown]
     tasks: tuple[str, ...] = ()
 
 
@@ -73,10 +85,11 @@ def read_info(root: Path) -> dict[str, Any]:
     if version not in (VERSION, "v2.0", "v2.1"):
         raise DataError(f"{path} is of LeRobot's version {version}; 2.0, 2.1 and 3.0 can be read")
     features, fps = info.get("features"), info.get("fps")
-    if not isinstance(features, dict) or not isinstance(fps, int | float) or not fps > 0:
+    if not isinstance(features, dict) or not isinstance(fps, int | float) or not 1e-5 < fps < 1e6:
         raise DataError(f"{path} has no features or no fps")
-    if not all(isinstance(feature, dict) for feature in cast(dict[str, Any], features).values()):
-        raise DataError(f"{path} has an invalid feature")
+    for name, feature in cast(dict[str, Any], features).items():
+        if not isinstance(feature, dict):
+            raise DataError(f"{path} says of the feature {name} only {feature!r:.40}: no dtype")
     return info
 
 
@@ -95,7 +108,7 @@ def read_card(root: Path) -> EnvironmentCard | None:
 
 
 def read_places(root: Path) -> list[Place]:
-    """Read the location of every episode, in order of their numbers.
+    """Read the location of every episode, in order of their numbers, which may have gaps.
 
     Raises:
         DataError: the location of an episode is missing, damaged or leads out of `root`.
@@ -109,8 +122,9 @@ def read_places(root: Path) -> list[Place]:
         reason = f"{type(error).__name__}: {error}"
         raise DataError(f"{root / 'meta'} does not say where episodes lie ({reason})") from error
     places.sort(key=lambda place: place.episode)
-    if [place.episode for place in places] != list(range(len(places))):
-        raise DataError(f"{root / 'meta'} does not number its episodes from 0 without a gap")
+    for one, other in itertools.pairwise(places):
+        if one.episode == other.episode:
+            raise DataError(f"{root / 'meta'} has episode {one.episode} twice")
     return places
 
 
@@ -122,12 +136,14 @@ def read_columns(path: Path, names: list[str], episode: int) -> Any:
     """
     order = ["episode_index", "frame_index"]
     filters = [("episode_index", "==", episode)]
+    check_fetched(path)
     try:
+        parquet_file(path).close()
         table = parquet.read_table(
             path, columns=list(dict.fromkeys([*order, *names])), filters=filters
         )
         return table.sort_by([(name, "ascending") for name in order]).select(names)
-    except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
+    except (OSError, LookupError, ValueError, arrow.ArrowException) as error:
         raise _unreadable(path, error) from error
 
 
@@ -136,26 +152,15 @@ def _unreadable(path: Path, error: Exception) -> DataError:
     return DataError(f"{path} cannot be read ({reason})")
 
 
-@contextlib.contextmanager
-def as_one_sentence(root: Path) -> Generator[None]:
-    """Turn all errors that a damaged or forged dataset causes in the block into a `DataError`."""
-    try:
-        yield
-    except (OSError, AttributeError, arrow.ArrowException, *UNREADABLE) as error:
-        if isinstance(error, AcwmError):
-            raise
-        what = f"it is damaged, or not as LeRobot has it: {type(error).__name__}: {error}"
-        raise _unreadable(root, ValueError(what)) from error
-
-
 def _rows(root: Path) -> list[dict[str, Any]]:
-    paths = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    paths = sorted((root / "meta" / "episodes").glob("[!.]*/[!.]*.parquet"))
     if not paths:
         raise DataError(f"{root} has no meta/episodes: it is not a complete LeRobot dataset")
     rows: list[dict[str, Any]] = []
     for path in paths:
+        check_fetched(path)
         try:
-            file = parquet.ParquetFile(path)
+            file = parquet_file(path)
             plain = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             rows += file.read(columns=plain).to_pylist()
         except (OSError, ValueError, arrow.ArrowException) as error:
@@ -166,10 +171,11 @@ def _rows(root: Path) -> list[dict[str, Any]]:
 def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The episodes in the index of version 2, where each episode has its own files."""
     path = root / "meta" / "episodes.jsonl"
+    check_fetched(path)
     try:
         rows = [parse_json(line) for line in path.read_bytes().splitlines()]
         return [{**row, "chunk": row["episode_index"] // info["chunks_size"]} for row in rows]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, ArithmeticError) as error:
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
 
 
@@ -178,12 +184,12 @@ def _place(
 ) -> Place:
     episode, length = int(row["episode_index"]), int(row["length"])
     tasks = tuple(map(str, row.get("tasks") or ()))
-    videos: dict[str, tuple[Path, float]] = {}
+    videos: dict[str, Shown] = {}
     if "chunk" in row:  # version 2
         names = {"episode_chunk": row["chunk"], "episode_index": episode}
         for camera in filmed:
             path = _path(root, info["video_path"], {**names, "video_key": camera})
-            videos[camera] = path, 0.0
+            videos[camera] = Shown(path)
         return Place(episode, length, _path(root, info["data_path"], names), videos, tasks)
 
     def numbers(prefix: str) -> dict[str, Any]:
@@ -192,7 +198,9 @@ def _place(
     for camera in filmed:
         key = f"videos/{camera}"
         path = _path(root, info["video_path"], {**numbers(key), "video_key": camera})
-        videos[camera] = path, float(row[f"{key}/from_timestamp"])
+        end = row.get(f"{key}/to_timestamp")
+        start = float(row[f"{key}/from_timestamp"])
+        videos[camera] = Shown(path, start, None if end is None else float(end))
     return Place(episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks)
 
 
@@ -207,15 +215,19 @@ def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
         given = names[found[1]]
         return f"{given:0{found[2]}d}" if found[2] else str(given)
 
-    return inside(root, re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
+    name = Path(re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
+    if name.is_absolute() or ".." in name.parts:
+        raise DataError(f"{root / name} leads out of {root}, which is not allowed")
+    return root / name
 
 
 def _json(path: Path) -> dict[str, Any]:
+    check_fetched(path)
     try:
         content = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {path.parents[1]} is not a LeRobot dataset") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} is not a JSON object")

@@ -193,7 +193,7 @@ def spoil(path):
         (lambda r: change_info(r, data_path="{chunk_index.__class__}"), "cannot be read"),
         (lambda r: change_info(r, data_path="{secret}"), "does not say where episodes lie"),
         (lambda r: change_places(r, length=None), "does not say where episodes lie"),
-        (lambda r: change_places(r, episode_index=[0, 1, 1, 2]), "without a gap"),
+        (lambda r: change_places(r, episode_index=[0, 1, 1, 2]), "episode 1 twice"),
         (lambda r: change_places(r, data__file_index=[0, 0, 0, 7]), r"file-007\.parquet cannot"),
         (lambda r: spoil(r / "meta/episodes/chunk-000/file-000.parquet"), "cannot be read"),
         (lambda r: spoil(r / "data/chunk-000/file-000.parquet"), "cannot be read"),
