@@ -82,6 +82,7 @@ OWN = {
         "regression": (
             "model.objectives.regression:Regression",
             "squared error of a prediction at once; for models that do not denoise",
+            {"state_weight": ..., "motion_steps": ...},
         ),
     },
     "executor": {
@@ -114,6 +115,8 @@ class Component:
         tasks: for an environment, ``"package.module:TASK"`` of its tasks by name, see
             `acwm_core.env.task.Task`; the modules import no simulator.
         objective: for a model, the objective that it learns by if none was chosen along with it.
+        retired: parameters that earlier versions had, and recipes of old runs name, with the value
+            at which they did what is done today; `...` if it does not matter.
     """
 
     kind: str
@@ -129,6 +132,7 @@ class Component:
     tasks: Mapping[str, str] = field(default_factory=dict[str, str])
     objective: str | None = None
     install: str = ""
+    retired: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def part(self) -> str:
@@ -239,6 +243,7 @@ class Registry:
         tasks: Mapping[str, str] | None = None,
         objective: str | None = None,
         install: str = "",
+        retired: Mapping[str, Any] | None = None,
         **defaults: Any,
     ) -> None:
         """Register `name` for the lazy `target` ``"package.module:Attribute"``.
@@ -253,6 +258,7 @@ class Registry:
             tasks: for an environment, the targets of its tasks, by name.
             objective: for a model, the objective that it learns by, if it has one of its own.
             install: what to do if the extra cannot install these modules, e.g. on this Python.
+            retired: parameters of earlier versions, see `Component.retired`.
             **defaults: parameters that this name presets.
 
         Raises:
@@ -269,7 +275,7 @@ class Registry:
             raise PluginError(f"{self.kind} {name!r} is already registered by plugin {owner!r}")
         self._components[name] = Component(
             *(self.kind, name, target, self._plugin, self._distribution, summary, extra, requires),
-            *(defaults, physics, dict(tasks or {}), objective, install),
+            *(defaults, physics, dict(tasks or {}), objective, install, dict(retired or {})),
         )
 
     def include(self, component: Component) -> None:
@@ -348,8 +354,10 @@ class Catalog:
             self.registry("kind").add(kind, target, summary=summary, check=check)
             self._open(kind)
         for kind, components in OWN.items():
-            for name, (target, summary) in components.items():
-                self.registry(kind).add(name, f"acwm_core.{target}", summary=summary)
+            for name, (target, summary, *retired) in components.items():
+                self.registry(kind).add(
+                    name, f"acwm_core.{target}", summary=summary, retired=dict(*retired)
+                )
 
     def _open(
         self, kind: str, plugin: str = "acwm_core", distribution: str | None = "acwm"

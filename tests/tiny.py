@@ -309,19 +309,19 @@ class Exact(Predictor):
     """
 
     width, layers, heads = 2 * STRIDE, 0, 1
-    causal = streams = True
+    causal = True
     blind = False
 
     def __init__(self, *, latent_channels: int):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
-    def forward(self, given, conditioning, frames):
+    def forward(self, given, conditioning, frames, generators=()):
         stream = self.stream(given, context=None)
         more = [stream.advance(conditioning.frames(k - 1, k + 1)) for k in range(1, frames)]
         return torch.cat(more, 1)
 
-    def stream(self, given, *, context):
+    def stream(self, given, *, context, generators=()):
         return _ExactStream(given, self.blind)
 
 

@@ -200,21 +200,43 @@ class DynamicsChecks(PredictionTrial):
 
     @torch.no_grad()
     def returns_only_the_frames_asked_for(self) -> None:
-        """With `skips` true, return with `only` the same frames as without."""
-        if not (isinstance(self._model, Predictor) and self._model.skips):
-            raise NotTried("it returns all frames")
+        """Let `predict_frames` return the same frames as `forward`."""
+        model = self._model
+        if not (isinstance(model, Predictor) and model.implements("predict_frames")):
+            raise NotTried("it saves no work for frames that nobody asks for")
         latents, modulation = self._inputs()
         batch, frames = SHAPE[:2]
-        only = torch.arange(batch)[:, None] % (frames - 1)
+        numbers = torch.arange(batch)[:, None] % (frames - 1)
         clip = latents[:, :1], probed(modulation), frames
-        whole = self._model(*clip, **self._drawing(batch))
-        some = self._model(*clip, **self._drawing(batch), only=only)
-        error = batch_error(whole.take_along_dim(only[..., None, None, None], 1), some)
-        expect(error < 1e-3, f"with only it returns frames that differ by {error:.2g}")
+        whole = model(*clip, draws(batch))
+        some = model.predict_frames(*clip, numbers, draws(batch))
+        error = batch_error(whole.take_along_dim(numbers[..., None, None, None], 1), some)
+        expect(error < 1e-3, f"predict_frames returns frames that differ by {error:.2g}")
 
-    def _drawing(self, batch: int) -> dict[str, Any]:
-        """The further argument of a predictor that draws."""
-        return {"generators": draws(batch)} if self._model.samples else {}
+    @torch.no_grad()
+    def predicts_states_of_every_frame(self) -> None:
+        """Let `predict_states` follow the actions, the first ones of each clip first."""
+        model = self._model
+        if not (isinstance(model, Predictor) and model.implements("predict_states")):
+            raise NotTried("it predicts no states")
+        latents, modulation = self._inputs()
+        batch, frames = SHAPE[:2]
+        given, changed = latents[:, :1], modulation.clone()
+        changed[:, -1] += 1
+        usual, other = (
+            model.predict_states(given, probed(each), frames, draws(batch))
+            for each in (modulation, changed)
+        )
+        expect(usual.ndim == 3 and len(usual) == batch, f"states are {list(usual.shape)}")
+        per_frame, rest = divmod(usual.shape[1], frames - 1)
+        expect(per_frame > 0 and not rest, f"states of {usual.shape[1]} video frames")
+        expect(not usual.isinf().any(), "states are infinite")
+        before = usual.shape[1] - per_frame
+        same = usual[:, :before].allclose(other[:, :before], 1e-4, 1e-4, equal_nan=True)
+        expect(same, "states of earlier frames change with the last action")
+        alike = model.predict_states(given[:1], probed(modulation), frames, draws(batch))
+        error = batch_error(usual[:1].nan_to_num(), alike[:1].nan_to_num())
+        expect(error < 1e-3, "a beginning that all clips share gives other states")
 
 
 class DenoiserChecks(Suite):

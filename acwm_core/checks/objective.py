@@ -13,7 +13,6 @@ from acwm_core.checks.trial import (
     WIDTH,
     PredictionTrial,
     TinyDenoiser,
-    TinyDrawer,
     TinyPredictor,
     batch_error,
     batch_of,
@@ -48,9 +47,11 @@ class ObjectiveChecks(PredictionTrial):
 
     def _fresh_model(self) -> DynamicsModel:
         cast(Any, torch).manual_seed(0)
+        if (example := self._objective.example_model(CHANNELS)) is not None:
+            return example
         if issubclass(self._objective.trains, Denoiser):
             return TinyDenoiser(CHANNELS, self._objective.inputs)
-        return (TinyDrawer if self._objective.draws else TinyPredictor)(CHANNELS)
+        return TinyPredictor(CHANNELS)
 
     def _inputs(self, batch: int = BATCH, seed: int = 1) -> tuple[Latent, Tensor]:
         modulation = noise((batch, FRAMES, WIDTH), seed)  # of the actions
@@ -84,7 +85,6 @@ class ObjectiveChecks(PredictionTrial):
         plain = TinyDenoiser(CHANNELS, {})
         others: list[DynamicsModel] = [TinyPredictor(CHANNELS) if denoises else plain]
         others += [plain] if self._objective.inputs else []
-        others += [TinyPredictor(CHANNELS)] if self._objective.draws else []
         for other in others:
             try:
                 self._objective.check_model(other)

@@ -16,6 +16,7 @@ from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment, EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch, noise_of_clips
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import (
     Cache,
@@ -27,7 +28,7 @@ from acwm_core.model.dynamics import (
 )
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.flow import evaluation
-from acwm_core.model.objectives.objective import Batch, Objective, drawn_noise
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Latent, Sigmas, Tokens, Video
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -355,18 +356,26 @@ class TinyPredictor(Predictor):
     """
 
     width, layers, heads = WIDTH, 0, 1
-    causal = streams = True
+    causal = True
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.move = nn.Linear(WIDTH, channels)
 
-    def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
+    def forward(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[torch.Generator] = (),
+    ) -> Latent:
         assert conditioning.modulation is not None
         moves = self.move(conditioning.modulation[:, given.shape[1] : frames]).cumsum(1)
         return given[:, -1:] + moves[..., None, None]
 
-    def stream(self, given: Latent, *, context: int) -> LatentStream:
+    def stream(
+        self, given: Latent, *, context: int, generators: Sequence[torch.Generator] = ()
+    ) -> LatentStream:
         return _Moved(self.move, given[:, -1:])
 
 
@@ -384,7 +393,6 @@ class TinyDrawer(TinyPredictor):
         given: Latent,
         conditioning: Conditioning,
         frames: int,
-        *,
         generators: Sequence[torch.Generator] = (),
     ) -> Latent:
         return super().forward(given, conditioning, frames) + self.draw(given, generators)
@@ -396,7 +404,7 @@ class TinyDrawer(TinyPredictor):
 
     def draw(self, given: Latent, generators: Sequence[torch.Generator]) -> Latent:
         """What is added, `[B, 1, C, h, w]`."""
-        return self.size * drawn_noise((1, *given.shape[2:]), generators)
+        return self.size * noise_of_clips((1, *given.shape[2:]), generators)
 
 
 class _Moved(LatentStream):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, cast
@@ -11,13 +10,12 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import PluginError, RecipeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, ModelInputs
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import float32_by_default
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.recipe import ComponentConfig, Recipe
-from acwm_core.recipe.signature import signature
 
 ComponentT = TypeVar("ComponentT")
 
@@ -49,8 +47,8 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
     codec = build_codec(recipe.codec)
     objective = build_objective(recipe.objective)
     states = state_shapes(recipe.data.get("states", ()), card)
-    size = sum(math.prod(shape) for shape in states.values())
-    model = build_model(recipe.model, objective, codec.channels, size, codec.temporal_stride)
+    inputs = ModelInputs(codec.channels, codec.temporal_stride, card, tuple(states))
+    model = build_model(recipe.model, objective, inputs)
     conditioner = build_conditioner(
         recipe.conditioner, model, card.action.size, codec.temporal_stride
     )
@@ -89,36 +87,19 @@ def build_objective(choice: ComponentConfig) -> Objective[Any]:
 
 
 def build_model(
-    choice: ComponentConfig,
-    objective: Objective[Any],
-    latent_channels: int,
-    state_size: int = 0,
-    temporal_stride: int = 1,
+    choice: ComponentConfig, objective: Objective[Any], inputs: ModelInputs
 ) -> DynamicsModel:
-    """Build the dynamics model that a recipe names, as the objective needs it.
+    """Build the dynamics model that a recipe names, as the objective and the data need it.
 
     Raises:
-        RecipeError: there are states to learn, which the model or the objective cannot; or there
-            are none, and the model needs them.
+        RecipeError: the model cannot learn from such data.
     """
     wanted = {"causal": objective.causal, "inputs": objective.inputs}
     left_open = {name: on for name, on in wanted.items() if choice.params.get(name, on) is None}
     choice = replace(choice, params={**choice.params, **left_open})
-    fitted = {"latent_channels": latent_channels}
     maker = catalog().component("model", choice.name).load()
-    if getattr(maker, "follows_states", False) and not state_size:
-        raise RecipeError(f"model={choice.name} learns from states: name them in data.states")
-    takes = signature(maker).parameters
-    if "temporal_stride" in takes:
-        fitted["temporal_stride"] = temporal_stride
-    if state_size:
-        if not objective.learns_states or "state_size" not in takes:
-            raise RecipeError(
-                f"model={choice.name} with {type(objective).__name__} learns no states of the "
-                "agent: leave out data.states, or choose a model that does"
-            )
-        fitted["state_size"] = state_size
-    model = build_component("model", choice, DynamicsModel, **fitted)
+    fitted = getattr(maker, "fitted", DynamicsModel.fitted)  # a function has none
+    model = build_component("model", choice, DynamicsModel, **fitted(inputs))
     objective.check_model(model)
     return model
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Literal, cast
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, cast
 
 from torch import Generator, Tensor, nn
 
+from acwm_core.env.card import EnvironmentCard
 from acwm_core.errors import RecipeError
-from acwm_core.model.batch import Batch
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.shapes import Latent, Sigmas
 
@@ -19,14 +19,31 @@ InputKind = Literal["latent", "level"]
 frame `[B, L]`."""
 
 
+class ModelInputs(NamedTuple):
+    """What a model is built for.
+
+    Attributes:
+        latent_channels: channels C of the codec's latents.
+        temporal_stride: video frames per latent frame of the codec.
+        environment: the card of the environment that the data shows.
+        states: names of the fields of its state to learn, in their order (`data.states`).
+    """
+
+    latent_channels: int
+    temporal_stride: int
+    environment: EnvironmentCard
+    states: tuple[str, ...] = ()
+
+
 class DynamicsModel(nn.Module, ABC):
     """A network that an objective trains to predict latent frames from embedded actions.
 
     It is a `Denoiser`, which removes noise step by step, or a `Predictor`, which computes frames
     directly.
 
-    Every model takes the keyword argument `latent_channels`, which the framework fills in from the
-    codec. Its own parameters come after it and are set in the recipe. The latent size h × w and the
+    Every model takes the keyword argument `latent_channels`, which follows from the codec, and what
+    else its `fitted` takes from the data. Its own parameters come after these and are set in the
+    recipe. The latent size h × w and the
     length L are those of the input; a model raises `ShapeError` for sizes it does not support.
 
     A model with layers calls the conditioner before the first one (`Conditioning.inject_input`) and
@@ -48,6 +65,38 @@ class DynamicsModel(nn.Module, ABC):
     heads: int
     causal: bool = False
     samples: bool = False
+
+    @classmethod
+    def fitted(cls, data: ModelInputs) -> dict[str, Any]:
+        """The constructor's arguments that follow from the codec and the data.
+
+        Raises:
+            RecipeError: a model of this kind cannot learn from such data.
+        """
+        return {"latent_channels": data.latent_channels}
+
+    @classmethod
+    def default_states(
+        cls, environment: EnvironmentCard, changing: Collection[str]
+    ) -> tuple[str, ...]:
+        """The fields of the state to learn where a recipe names none; none by default.
+
+        Args:
+            environment: the card of the environment that the data shows.
+            changing: names of the fields that change within episodes.
+        """
+        return ()
+
+    def upgrade(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weights that an earlier version of the model saved, under the names that it has now.
+
+        Args:
+            weights: by name, as in the model's state dict; they need not be of an earlier version.
+
+        Raises:
+            RecipeError: this version cannot use them.
+        """
+        return weights
 
     @functools.cached_property
     def widths(self) -> tuple[int, ...]:
@@ -138,77 +187,61 @@ class Denoiser(DynamicsModel):
 class Predictor(DynamicsModel):
     """A network that computes the frames after the given ones directly, without denoising.
 
-    One that samples a future (`samples`) takes the further keyword ``generators`` in `forward`, in
-    `stream` and in `predict_states`: one CPU generator per clip, its only source of randomness. All
-    three sample the same future.
+    All methods take ``generators``, one CPU generator per clip: the only source of randomness of a
+    model that draws a future (`samples`). All draw alike, so that the future stays the same one.
+    Other models leave them unused.
 
-    One that can learn the agent's states takes the argument ``state_size: int = 0``, their number,
-    which the framework fills in, and implements `state_loss`, and `motion_loss` if it can learn how
-    actions move the agent without a picture.
-
-    One that draws pictures from states (`follows_states`) gets them in every video frame
-    `[B, T, S]`, in `state_loss` and `motion_loss`, and while it is trained, by the further keyword
-    ``states: Tensor | None`` of `forward`. Without them it estimates them.
-
-    One that saves work if it need not return all frames (`skips`) takes the further keyword
-    ``only: Tensor | None`` in `forward`: for each clip the numbers `[B, N]` of the frames to
-    return, counted from the first predicted one.
-
-    One that predicts the scene's states (`predicts_states`) returns them from `predict_states`,
-    without drawing a picture.
-
-    Attributes:
-        streams: whether it implements `stream`, which is then the default mode of rollouts.
-        skips: whether `forward` takes ``only``.
-        follows_states: whether `forward` takes ``states``, for every video frame.
-        raw_states: whether it takes states as they were recorded, and not scaled to variance 1.
-        predicts_states: whether it implements `predict_states`.
+    Only `forward` is required. The other methods are further abilities.
     """
 
-    streams: bool = False
-    skips: bool = False
-    follows_states: bool = False
-    raw_states: bool = False
-    predicts_states: bool = False
-
     @abstractmethod
-    def forward(self, given: Latent, conditioning: Conditioning, frames: int) -> Latent:
+    def forward(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[Generator] = (),
+    ) -> Latent:
         """Predict the latent frames of a clip that follow the given ones.
 
         Args:
             given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
             conditioning: the embedded actions of the clip.
             frames: length L of the clip, including the given frames.
+            generators: one per clip; may be empty if the model does not draw.
 
         Returns:
             `[B, L − K, C, h, w]`.
         """
 
-    def state_loss(self, batch: Batch) -> Tensor:
-        """The loss of its prediction of the agent's `batch.states`, a scalar. Optional.
-
-        States are available in training only; `forward` does not get them.
-        """
-        raise RecipeError(f"{type(self).__name__} learns no states: leave out data.states")
-
-    def motion_loss(
-        self, states: Tensor, conditioning: Conditioning, random: Generator, *, progress: float
-    ) -> Tensor:
-        """The loss of how actions move the agent, without pictures, a scalar. Optional.
+    def predict_frames(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        numbers: Tensor,
+        generators: Sequence[Generator] = (),
+    ) -> Latent:
+        """Predict some of these frames; a model that can save the work for the others overrides it.
 
         Args:
-            states: of the agent in each latent frame, `[B, L, S]`, scaled as in `Batch.states`.
-            conditioning: the embedded actions of the clips.
-            random: a CPU generator, the only source of randomness.
-            progress: share of the training that is over, 0 to 1, for models that learn from short
-                clips first.
-        """
-        raise RecipeError(
-            f"{type(self).__name__} learns no motion without pictures: leave out "
-            "training.agent_steps"
-        )
+            given, conditioning, frames, generators: as in `forward`.
+            numbers: for each clip the frames to return, counted from the first predicted one,
+                `[B, N]`.
 
-    def predict_states(self, given: Latent, conditioning: Conditioning, frames: int) -> Tensor:
+        Returns:
+            `[B, N, C, h, w]`.
+        """
+        whole = self(given, conditioning, frames, generators)
+        return whole.take_along_dim(numbers[..., None, None, None], 1)
+
+    def predict_states(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[Generator] = (),
+    ) -> Tensor:
         """The states in each video frame after the given ones, `[B, T, S]`. Optional.
 
         In the recorded units; NaN where unknown.
@@ -218,21 +251,34 @@ class Predictor(DynamicsModel):
                 clips have the same start.
             conditioning: the embedded actions of B clips.
             frames: length L of the clips, including the given frames.
+            generators: as in `forward`.
+
+        Raises:
+            RecipeError: the model predicts no states.
         """
         raise RecipeError(f"{type(self).__name__} predicts no states")
 
-    def stream(self, given: Latent, *, context: int) -> LatentStream:
+    def stream(
+        self, given: Latent, *, context: int, generators: Sequence[Generator] = ()
+    ) -> LatentStream:
         """Predict one latent frame at a time, without end. Optional, for causal models.
+
+        A model that implements it is streamed by default.
 
         Args:
             given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
             context: number of latent frames that a frame sees, including itself, at least 2; for
                 models whose memory is bounded in this way.
+            generators: as in `forward`.
 
         Raises:
             RecipeError: the model cannot be evaluated frame by frame.
         """
         raise RecipeError(f"{type(self).__name__} has no `stream`, so it cannot be streamed")
+
+    def implements(self, method: Literal["predict_frames", "predict_states", "stream"]) -> bool:
+        """Whether the model has one of the optional abilities."""
+        return getattr(type(self), method) is not getattr(Predictor, method)
 
 
 class LatentStream(ABC):

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError, ShapeError
+from acwm_core.model.batch import Batch
 from acwm_core.model.codec import Codec
-from acwm_core.model.conditioner import Conditioner
+from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import DynamicsModel, Predictor, hidden_matrices
-from acwm_core.model.objectives.objective import Batch, Objective
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels, float32_by_default
 from acwm_core.model.stream import Stream, continued
 
@@ -47,8 +48,6 @@ class WorldModel(nn.Module):
 
     action_low: Tensor
     action_high: Tensor
-    state_mean: Tensor
-    state_std: Tensor
 
     def __init__(
         self,
@@ -76,10 +75,6 @@ class WorldModel(nn.Module):
         self.register_buffer("action_low", torch.tensor(action_low), persistent=False)
         self.register_buffer("action_high", torch.tensor(action_high), persistent=False)
         self.state_shapes = {name: tuple(shape) for name, shape in (state_shapes or {}).items()}
-        state_size = sum(math.prod(shape) for shape in self.state_shapes.values())
-        # Needed in training only: `TrainingModule` sets them.
-        self.register_buffer("state_mean", torch.zeros(state_size), persistent=False)
-        self.register_buffer("state_std", torch.ones(state_size), persistent=False)
 
     def train(self, mode: bool = True) -> WorldModel:
         """Like `nn.Module.train`, but the frozen codec stays in evaluation mode."""
@@ -139,44 +134,60 @@ class WorldModel(nn.Module):
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
-        rows = self._prepare(actions, latents.shape[1])
-        conditioning = self.conditioner.condition(rows, latents.shape[1], self.model.width)
+        conditioning = self.condition(actions, latents.shape[1])
         known = self.codec.latent_frames(self.context_frames)
-        batch = Batch(latents, conditioning, generators, self._scaled(states))
+        batch = Batch(latents, conditioning, generators, states)
         return self.objective.loss(self.model, batch, known)
 
-    def motion_loss(
-        self, actions: Actions, states: Tensor, random: torch.Generator, *, progress: float
-    ) -> Tensor:
-        """The loss of how actions move the agent, without pictures, a scalar.
+    def condition(self, actions: Actions, latent_frames: int) -> Conditioning:
+        """The embedded raw actions `[B, T, A]` of clips of so many latent frames."""
+        rows = self._prepare(actions, latent_frames)
+        return self.conditioner.condition(rows, latent_frames, self.model.width)
+
+    @torch.no_grad()
+    def predict_states(
+        self, given: Frame | Video, actions: Actions, *, seeds: Sequence[int] | None = None
+    ) -> dict[str, Tensor]:
+        """Predict the fields of the state after the given frames, without drawing a picture.
 
         Args:
-            actions: as in `loss`.
-            states: as in `loss`.
-            random: a CPU generator.
-            progress: share of the training that is over, 0 to 1.
+            given: the first frames, as for `rollout_chunks`.
+            actions: raw actions `[B, T, A]` of all frames.
+            seeds: one per batch element; 0, 1, … by default.
+
+        Returns:
+            By name, `[B, T − K, …]` in the units of the card; NaN where the model knows none.
 
         Raises:
-            RecipeError: the model learns none.
+            RecipeError: the model predicts no states.
         """
-        if not isinstance(self.model, Predictor):
-            raise RecipeError(
-                f"{type(self.model).__name__} learns no states: leave out training.agent_steps"
-            )
-        frames = self.codec.latent_frames(states.shape[1])
-        rows = self._prepare(actions, frames)
-        conditioning = self.conditioner.condition(rows, frames, self.model.width)
-        scaled = self._scaled(states)
-        assert scaled is not None
-        return self.model.motion_loss(scaled, conditioning, random, progress=progress)
+        if not isinstance(self.model, Predictor) or not self.predicts_states:
+            raise RecipeError(f"{type(self.model).__name__} predicts no states")
+        video = self._given(given)
+        frames = actions.shape[1]
+        length = self.codec.latent_frames(frames)
+        values = self.model.predict_states(
+            self.codec.encode(video),
+            self.condition(actions, length),
+            length,
+            _generators(video, len(actions), seeds),
+        )[:, : frames - video.shape[1]]
+        return self.named_states(values)
 
-    def _scaled(self, states: Tensor | None) -> Tensor | None:
-        """States of a clip's frames as the model takes them; see `Batch.states`."""
-        if states is None or not isinstance(self.model, Predictor):
-            return states
-        if not self.model.follows_states:
-            states = states[:, :: self.codec.temporal_stride]
-        return states if self.model.raw_states else (states - self.state_mean) / self.state_std
+    def named_states(self, values: Tensor) -> dict[str, Tensor]:
+        """States `[B, T, S]` as the fields that they are, `[B, T, …]` by name."""
+        sizes = [math.prod(shape) for shape in self.state_shapes.values()]
+        fields = zip(self.state_shapes.items(), values.split(sizes, 2), strict=True)
+        return {
+            name: part.unflatten(2, shape or (1,)).reshape(*part.shape[:2], *shape)
+            for (name, shape), part in fields
+        }
+
+    @property
+    def predicts_states(self) -> bool:
+        """Whether the model can predict states, and knows which fields of the card they are."""
+        able = isinstance(self.model, Predictor) and self.model.implements("predict_states")
+        return able and bool(self.state_shapes)
 
     @float32_by_default()
     def rollout(
@@ -344,10 +355,8 @@ class WorldModel(nn.Module):
     ) -> Latent:
         """Predict the latents of one window, with as many frames as there are action rows."""
         latents, length = self.codec.encode(given), self.codec.latent_frames(actions.shape[1])
-        rows = self._prepare(actions, length)
-        conditioning = self.conditioner.condition(rows, length, self.model.width)
         if length > latents.shape[1]:
-            begin = Batch(latents, conditioning, generators)
+            begin = Batch(latents, self.condition(actions, length), generators)
             latents = self.objective.predict(self.model, begin, length, steps)
         return latents
 

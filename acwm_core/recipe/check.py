@@ -24,7 +24,7 @@ SECTIONS = {
 are checked without importing torch."""
 
 FITTED = {
-    "model": ("latent_channels", "state_size", "temporal_stride"),
+    "model": ("latent_channels", "temporal_stride", "state_size"),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads", "widths"),
 }
 """Parameters that follow from the other components and the dataset, never from a recipe."""
@@ -101,6 +101,7 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
     """
     component, params = _component(section, choice)
     inherited = params.pop(INHERITED, {})
+    params = _without_retired(section, component, params)
     values = {**component.defaults, **params}
     takes = signature(resolve_name("acwm_core.env.environment:Environment"))
     if section != "env" or values.keys() - takes.parameters:
@@ -142,6 +143,19 @@ def _component(section: str, choice: Any) -> tuple[Component, dict[str, Any]]:
     if not isinstance(name, str):
         raise RecipeError(f"the recipe names no {section}; add {section}=NAME (see `acwm list`)")
     return catalog().component("environment" if section == "env" else section, name), params
+
+
+def _without_retired(
+    section: str, component: Component, params: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The parameters without those that only earlier versions of the component had."""
+    for name, kept in component.retired.items():
+        if name in params and kept is not ... and params[name] != kept:
+            raise RecipeError(
+                f"{section}.{name}={types.show(params[name])}: {component.name} has no parameter "
+                f"{name!r} any more, and does what {types.show(kept)} did"
+            )
+    return {name: value for name, value in params.items() if name not in component.retired}
 
 
 def _signature_of(component: Component) -> Signature:

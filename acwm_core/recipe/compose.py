@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.errors import DataError, RecipeError, suggest
+from acwm_core.errors import AcwmWarning, DataError, RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_core.recipe.former import current_sections
 from acwm_core.recipe.objective import INHERITED, chosen, inherited
@@ -17,6 +18,9 @@ OVERLAYS = "overlays"
 
 VARIANTS = "paper"
 """Folder of the packaged recipes that vary another one."""
+
+FORMER_PARAMETERS = {"training.agent_steps": "objective.motion_steps"}
+"""Parameters that overrides may name by what they were called before."""
 
 COMPONENTS = ("env", "codec", "model", "conditioner", "objective")
 """Sections that hold a component, i.e. a registered name and its parameters."""
@@ -66,6 +70,11 @@ def parse_override(override: str) -> dict[str, Any]:
             "component=name or +overlay"
         )
     value: Any = parse(text, f"the value of {override!r}")
+    if path in FORMER_PARAMETERS:
+        path = FORMER_PARAMETERS[path]
+        message = f"{override} is now called {path}={text}"
+        warnings.warn(message, AcwmWarning, stacklevel=2)
+        names = path.split(".")
     for name in reversed(names[1:]):
         value = {name: value}
     return {names[0]: _normal(names[0], value)}

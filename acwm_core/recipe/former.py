@@ -19,7 +19,8 @@ def current_sections(sections: Mapping[str, Any]) -> dict[str, Any]:
     """Sections of a recipe file as they are written today.
 
     Until 0.1, the objective was a parameter of the section `flow`, a model had `previous`, which
-    follows from the objective, and `data.skip_damaged` passed over shards.
+    follows from the objective, and `data.skip_damaged` passed over shards. Until 0.2,
+    `objective.motion_steps` was `training.agent_steps`.
     """
     current = {name: value for name, value in sections.items() if name != "flow"}
     for section, name in (("model", "previous"), ("data", "skip_damaged")):
@@ -30,6 +31,19 @@ def current_sections(sections: Mapping[str, Any]) -> dict[str, Any]:
         current["evaluation"] = current_settings(cast(Mapping[str, Any], evaluation))
     if flow := sections.get("flow"):
         current["objective"] = _objective(flow, current.get("objective"))
+    return _with_motion_steps(current)
+
+
+def _with_motion_steps(sections: dict[str, Any]) -> dict[str, Any]:
+    training: Any = sections.get("training")
+    if not isinstance(training, Mapping) or "agent_steps" not in training:
+        return sections
+    values = dict(cast(Mapping[str, Any], training))
+    steps, current = values.pop("agent_steps"), {**sections, "training": values}
+    if steps:
+        given: Any = sections.get("objective") or {}
+        objective = {"name": given} if isinstance(given, str) else dict(given)
+        current["objective"] = {"motion_steps": steps, **objective}
     return current
 
 

@@ -78,9 +78,6 @@ class TrainingConfig:
         random_starts: fraction of the steps in which a random number of latent frames is cut off
             the start of clips, so that a model trained on whole episodes also starts from frames
             other than the first. A first frame is alone in its latent frame, a later one is not.
-        agent_steps: steps, before the first one on pictures, that learn from states and actions
-            alone how actions move the agent (`data.states`); what they taught then stays as it is.
-            They cost little, and the agent is known better than pictures teach it. 0 for none.
         ema_decay: decay of the moving average of the weights; validation, samples and the saved
             model use the average. 0 uses the weights themselves.
         init_from: a run folder, or a trained model's name, whose weights training starts from; by
@@ -113,7 +110,6 @@ class TrainingConfig:
     decay_start: FractionBelowOne = 0.0
     growing_horizon: Fraction = 0.0
     random_starts: Fraction = 0.0
-    agent_steps: NonNegativeInt = 0
     ema_decay: FractionBelowOne = 0.999
     init_from: str | None = None
     ignore_mismatched_sizes: bool = False

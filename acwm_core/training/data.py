@@ -118,6 +118,16 @@ class ClipData(L.LightningDataModule):
         self._validation = self._clips(self._split[1], self._stride, cached=self._cached)
 
     @property
+    def device(self) -> torch.device:
+        """The device that trains."""
+        return self._trainer().strategy.root_device
+
+    @property
+    def is_first_process(self) -> bool:
+        """Whether this is the process that reports progress."""
+        return self._trainer().is_global_zero
+
+    @property
     def training_clips(self) -> ClipDataset | LatentClipDataset:
         """The clips to train on, once they are open."""
         return self._train

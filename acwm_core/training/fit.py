@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers.logger import Logger
 from torch.distributed import DistBackendError
@@ -22,8 +23,10 @@ from acwm_core.env.card import EnvironmentCard, meaning_differences
 from acwm_core.env.environment import resolve_size
 from acwm_core.errors import AcwmError, AcwmWarning, RecipeError, TrainingError
 from acwm_core.model.build import build_world_model
+from acwm_core.model.dynamics import DynamicsModel
 from acwm_core.model.shapes import float32_by_default
 from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe, recipe_differences
 from acwm_core.training import callbacks
 from acwm_core.training.checkpoints import read_step
@@ -82,6 +85,7 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         growing = recipe.data.get("growing", False)
         episodes = EpisodeDataset(recipe.data["path"], "train", growing=growing)
         _check_environment(recipe, episodes.card)
+        recipe = _with_states(recipe, episodes)
         with first_decides():
             claim.enter_context(claimed(run))
             checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
@@ -111,9 +115,9 @@ def _train(
     continued: Sequence[Logger],
 ) -> None:
     config = TrainingConfig(**recipe.training)
-    _check_states(config, recipe)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, episodes.card.environment)
+    _check_states(recipe, world_model)
     start = None
     if config.init_from and checkpoint is None:
         _check_meaning(config, episodes.card.environment)
@@ -146,11 +150,11 @@ def _train(
         _check_saved(run, trainer)
 
 
-def _check_states(config: TrainingConfig, recipe: Recipe) -> None:
-    if config.agent_steps and not recipe.data.get("states"):
+def _check_states(recipe: Recipe, world_model: WorldModel) -> None:
+    if recipe.data.get("states") and not world_model.objective.learns_states:
         raise RecipeError(
-            f"training.agent_steps={config.agent_steps} learn how the agent's states move: name "
-            "them, data.states=[…], or leave it out"
+            f"objective={recipe.objective.name} learns no states: leave out data.states, or choose "
+            "a model and an objective that do, such as by +scene"
         )
 
 
@@ -187,6 +191,18 @@ def _check_meaning(config: TrainingConfig, card: EnvironmentCard) -> None:
         )
     if message and is_first_process():
         warnings.warn(message, AcwmWarning, stacklevel=2)
+
+
+def _with_states(recipe: Recipe, episodes: EpisodeDataset) -> Recipe:
+    """The recipe with the fields of the state that its model learns if it names none."""
+    model = catalog().component("model", recipe.model.name).load()
+    choose = getattr(model, "default_states", DynamicsModel.default_states)
+    if recipe.data.get("states") or choose.__func__ is DynamicsModel.default_states.__func__:
+        return recipe
+    card = episodes.card.environment
+    names = [each.name for each in card.state]
+    changing = [name for name in names if np.ptp(episodes.states(0, [name]), 0).any()]
+    return replace(recipe, data={**recipe.data, "states": [*choose(card, changing)]})
 
 
 def _start_from(

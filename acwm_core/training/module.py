@@ -19,14 +19,12 @@ from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.checkpoints import without_codec
 from acwm_core.training.config import TrainingConfig
-from acwm_core.training.data import ClipData
 from acwm_core.training.layers import (
     recompute_activations,
     shard,
     sharding_mesh,
     trained_layers,
 )
-from acwm_core.training.motion import learn_motion
 from acwm_core.training.optimizers import (
     averaged_copy,
     build_optimizer,
@@ -35,6 +33,7 @@ from acwm_core.training.optimizers import (
     update_average,
 )
 from acwm_core.training.precision import PRECISION
+from acwm_core.training.preparation import PreparationClips
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
 """Separate random streams, so that validation never repeats the noise of a training step."""
@@ -82,25 +81,14 @@ class TrainingModule(L.LightningModule):
         self._losses: list[Tensor] = []
 
     def setup(self, stage: str) -> None:
-        """Take the scale of the states to learn from the data, and learn how the agent moves."""
-        if not len(self.world_model.state_mean):
-            return
-        data = cast(Any, self.trainer).datamodule
-        mean, std = data.state_scale()
-        self.world_model.state_mean.copy_(mean)
-        self.world_model.state_std.copy_(std)
-        if self.config.agent_steps:
-            self._learn_motion(data)
-
-    def _learn_motion(self, data: ClipData) -> None:
-        """Learn how actions move the agent; a resumed run has learnt it and goes on from there."""
-        trainer, config = self.trainer, self.config
-        steps = 0 if trainer.ckpt_path else config.agent_steps
-        self.world_model.to(trainer.strategy.root_device)
-        clips, shown = data.training_clips, trainer.is_global_zero
-        learn_motion(self.world_model, clips, steps, seed=config.seed, shown=shown)
-        self.averaged.to(trainer.strategy.root_device)
-        update_average(self.averaged, self.world_model, 0)
+        """Let the objective prepare the model; the average starts as the prepared weights."""
+        world_model, data = self.world_model, cast(Any, self.trainer).datamodule
+        clips = PreparationClips(world_model, data, self.config.seed)
+        resumed = self.trainer.ckpt_path is not None
+        with noting("in preparing the model", *world_model.children()):
+            world_model.objective.prepare(world_model.model, clips, resumed=resumed)
+        self.averaged.to(world_model.device)
+        update_average(self.averaged, world_model, 0)
 
     def configure_model(self) -> None:
         """Set up activation checkpointing, compilation and sharding as the recipe says."""

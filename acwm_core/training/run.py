@@ -156,7 +156,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
             f"{own}): restore that codec or train again"
         )
-    weights, expected = _stored(path, facts), _trained(world_model)
+    weights, expected = _upgraded(world_model, _stored(path, facts)), _trained(world_model)
     for name in sorted({*weights, *expected}):
         found = tuple(weights[name].shape) if name in weights else "missing"
         wanted = tuple(expected[name].shape) if name in expected else "absent"
@@ -177,7 +177,8 @@ def load_fitting_weights(world_model: WorldModel, path: Path) -> list[str]:
         TrainingError: the file is damaged, or not one of its weights fits.
         DataError: its weights are not finite.
     """
-    weights, expected = _stored(path, read_metadata(path)), _trained(world_model)
+    stored = _stored(path, read_metadata(path))
+    weights, expected = _upgraded(world_model, stored), _trained(world_model)
     fitting = {
         name: value
         for name, value in expected.items()
@@ -199,6 +200,15 @@ def _stored(path: Path, facts: Mapping[str, Any]) -> dict[str, Tensor]:
         )
     check_finite(path, weights)
     return weights
+
+
+def _upgraded(world_model: WorldModel, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of a file, those of the model as its present version has them."""
+    prefix = "model."
+    own = {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
+    others = {k: v for k, v in weights.items() if not k.startswith(prefix)}
+    upgraded = world_model.model.upgrade(own)
+    return others | {prefix + name: value for name, value in upgraded.items()}
 
 
 def _trained(world_model: WorldModel) -> dict[str, Tensor]:

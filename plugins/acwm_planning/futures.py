@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -20,9 +20,9 @@ from acwm_core.env.physics import Observation, StateEstimator
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.model.batch import Batch
 from acwm_core.model.codec import Codec
 from acwm_core.model.dynamics import Predictor
-from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.precision import bfloat16_is_fast
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
@@ -304,8 +304,7 @@ class ModelRollouts:
 
         latents = given.latents.expand(len(actions), -1, -1, -1, -1)
         world = self.world_model
-        tells = isinstance(world.model, Predictor) and world.model.predicts_states
-        own = states if tells and world.state_shapes else None
+        own = states if world.predicts_states else None
         futures = ModelFutures(
             codec,
             latents,
@@ -318,7 +317,8 @@ class ModelRollouts:
             own,
             world.state_shapes,
         )
-        if not (isinstance(world.model, Predictor) and world.model.skips):
+        model = world.model
+        if not (isinstance(model, Predictor) and model.implements("predict_frames")):
             futures.latents(range(-past, length))  # all at once
         return futures
 
@@ -335,9 +335,8 @@ class ModelRollouts:
     def _predict_states(self, given: _Given, actions: Actions, seed: int) -> Tensor:
         """The states in all video frames after the given ones, `[N, T, S]`."""
         begin, length = self._begun(given, actions, seed)
-        model = cast(Any, self.world_model.model)
-        drawing = {"generators": begin.generators} if model.samples else {}
-        return model.predict_states(given.latents, begin.conditioning, length, **drawing)
+        model = cast(Predictor, self.world_model.model)
+        return model.predict_states(given.latents, begin.conditioning, length, begin.generators)
 
     def _begun(self, given: _Given, actions: Actions, seed: int) -> tuple[Batch, int]:
         """The beginning of the candidates' clips, and their number of latent frames."""

@@ -20,11 +20,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch, to_device
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.flow import MIN_SIGMA, evaluation, mix, per_frame
-from acwm_core.model.objectives.objective import Batch, sent
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -76,14 +76,14 @@ class ShortcutForcing(DiffusionForcing):
         places, steps = (
             functional.pad(torch.stack(each), (known, 0)) for each in zip(*drawn, strict=True)
         )
-        place, step = sent(places, latents), sent(steps, latents)
+        place, step = to_device(places, latents), to_device(steps, latents)
         sigma = self.level(place)
         noisy = mix(latents, batch.noise(latents.shape[1]), sigma)
         target = latents.clone()
         # Chosen on the CPU, so that nothing waits for an accelerator.
         chosen = steps.any(1).nonzero().flatten()
         if len(chosen):
-            long = sent(chosen, latents, torch.long)
+            long = to_device(chosen, latents, torch.long)
             own = of_clips(conditioning, long)
             found = self.target(model, own, noisy[long], place[long], step[long])
             with_step = per_frame(step[long]) > 0

@@ -61,7 +61,7 @@ def demo(out: Path | None, quick: bool) -> None:
     folder = out or Path("runs", "demo_quick" if quick else "demo")
     training, tests = (QUICK_TRAINING, QUICK_TESTS) if quick else (TRAINING, TESTS)
     data, run, shipped, report = (folder / n for n in ("data", "run", "shipped", "report.html"))
-    rehearsal = ["+quick", "training.agent_steps=5"] if quick else []
+    rehearsal = ["+quick", "objective.motion_steps=5"] if quick else []
     recipe = compose("demo", [*rehearsal, f"data.path={data}"])
     episodes, held_out = sum(training.values()), sum(tests.values())
 

@@ -10,10 +10,10 @@ from acwm_core.checks import check_conditioner
 from acwm_core.checks.conditioner import ConditionerChecks
 from acwm_core.checks.result import checks_of
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch
 from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import Denoiser
 from acwm_core.model.objectives.full_sequence import FullSequence
-from acwm_core.model.objectives.objective import Batch
 from acwm_core.model.objectives.regression import Regression
 from acwm_dit.adaln import AdaLN
 from tests.checks.results import Flaws, failures, installed

@@ -16,7 +16,8 @@ from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import DynamicsModel, Predictor
 from acwm_core.model.objectives.next_frame import NextFrame
 from acwm_dit.dit import DiT
-from acwm_recurrent.recurrent import RecurrentModel
+from acwm_scene.recurrent import RecurrentModel
+from acwm_scene.scene import SceneDynamics
 from tests.checks.results import Flaws, failures, installed
 from tests.checks.toys import SmallUNet
 from tests.tiny import PointwiseModel
@@ -150,7 +151,7 @@ def test_a_predictor_must_draw_from_the_generators(draw, reason):
 
 def test_a_stream_must_keep_the_draw():
     class Forgets(TinyDrawer):
-        def stream(self, given, *, context, generators):
+        def stream(self, given, *, context, generators=()):
             return TinyPredictor.stream(self, given, context=context)
 
     found = failures(check_model(latent_channels(Forgets)))
@@ -366,11 +367,44 @@ class ForgetsItsState(Recurrent):
 
 @FLAWS.caught_by("streams what it predicts", "refuses to stream")
 class OnlySaysThatItStreams(Recurrent):
-    def stream(self, given, *, context):
+    def stream(self, given, *, context, generators=()):
         return Predictor.stream(self, given, context=context)
 
 
 @FLAWS.caught_by("streams what it predicts", "after 2 given frames")
 class StreamsFromTheFirst(Recurrent):
-    def stream(self, given, *, context):
+    def stream(self, given, *, context, generators=()):
         return super().stream(given[:, :1], context=context)
+
+
+@FLAWS.caught_by("returns only the frames asked for", "frames that differ by")
+class ReturnsOtherFrames(Recurrent):
+    def predict_frames(self, given, conditioning, frames, numbers, generators=()):
+        return super().predict_frames(given, conditioning, frames, 0 * numbers)
+
+
+class Scene(SceneDynamics):
+    """A small model that predicts states, to spoil."""
+
+    def __init__(self, *, latent_channels):
+        super().__init__(latent_channels=latent_channels, channels=8, width=16, blocks=1)
+        self.prepare(torch.zeros(1), torch.ones(1))
+
+
+@FLAWS.caught_by("predicts states of every frame", "change with the last action")
+class KnowsLaterActions(Scene):
+    def embed(self, conditioning):
+        rows = super().embed(conditioning)
+        return {name: each + each[:, -1:] for name, each in rows.items()}
+
+
+@FLAWS.caught_by("predicts states of every frame", "states of 11 video frames")
+class LeavesOutAFrame(Scene):
+    def predict_states(self, given, conditioning, frames, generators=()):
+        return super().predict_states(given, conditioning, frames, generators)[:, 1:]
+
+
+@FLAWS.caught_by("predicts states of every frame", "states are infinite")
+class Diverges(Scene):
+    def predict_states(self, given, conditioning, frames, generators=()):
+        return super().predict_states(given, conditioning, frames, generators) / 0

@@ -5,12 +5,12 @@ import torch
 from torch import nn
 
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch
 from acwm_core.model.build import build_model
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Cache, Denoiser
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.next_frame import NextFrame, frames_before
-from acwm_core.model.objectives.objective import Batch
 from acwm_core.recipe import ComponentConfig
 from acwm_dit.dit import DiT
 

@@ -37,11 +37,9 @@ def test_the_zoo_has_a_model_of_every_world_on_data_of_its_own(tmp_path):
     made = plan("benchmark/zoo", tmp_path)
     assert made.experiment.groups == plan("benchmark/main", tmp_path).experiment.groups
     assert len(made.runs) == 8
-    kinds = {"push_cube": "planar_bodies"}
-    kinds |= dict.fromkeys(("push_rope", "cloth_move"), "flexible_body")
-    kinds |= dict.fromkeys(("robot_arm", "stack_cube", "reacher", "pour_water"), "drawn_states")
     for run in made.runs:
-        assert run.recipe.model.name == kinds.get(run.dataset.environment, "recurrent")
+        is_grid = run.dataset.environment == "push_sand"
+        assert run.recipe.model.name == ("recurrent" if is_grid else "scene")
         assert str(run.dataset.path) == f"data/{run.dataset.environment}_zoo"
         assert run.dataset.choice.episodes is not None
 

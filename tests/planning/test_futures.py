@@ -210,15 +210,13 @@ def test_predicted_states_are_those_of_the_last_planned_frames(bundle, history, 
     """Of a model that counts video frames from the given one on, and of plans of five actions."""
     world, stride = bundle.world_model, bundle.world_model.codec.temporal_stride
 
-    def count(given, conditioning, frames, **_):
+    def count(given, conditioning, frames, generators):
         assert len(given) == 1
         number = stride * (frames - given.shape[1])
         return torch.arange(1.0, 1 + number)[:, None].expand(3, -1, 2)
 
     monkeypatch.setattr(world, "state_shapes", {"pair": (2,)})
-    monkeypatch.setattr("acwm_planning.futures.Predictor", type(world.model))
-    for name, value in (("predicts_states", True), ("skips", False)):
-        monkeypatch.setattr(world.model, name, value, raising=False)
+    monkeypatch.setattr(type(world), "predicts_states", True)
     monkeypatch.setattr(world.model, "predict_states", count, raising=False)
     rollouts = ModelRollouts(world, bundle.card, None, past=past)
     (futures,) = seen(rollouts, history, candidates(3, 5))

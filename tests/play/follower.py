@@ -27,18 +27,18 @@ RADIUS = 4
 
 class Follower(Predictor):
     width, layers, heads = 2 * STRIDE, 0, 1
-    causal = streams = True
+    causal = True
 
     def __init__(self, *, latent_channels: int):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
-    def forward(self, given, conditioning, frames):
+    def forward(self, given, conditioning, frames, generators=()):
         stream = _FollowerStream(given)
         more = [stream.advance(conditioning.frames(k - 1, k + 1)) for k in range(1, frames)]
         return torch.cat(more, 1)
 
-    def stream(self, given, *, context):
+    def stream(self, given, *, context, generators=()):
         return _FollowerStream(given)
 
 

@@ -14,8 +14,9 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.data.pictures import to_pixels
+from acwm_core.env.camera import Camera
 from acwm_core.errors import AcwmError, DataError, RecipeError
-from acwm_core.model.objectives.objective import drawn_noise
+from acwm_core.model.batch import noise_of_clips
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
@@ -25,6 +26,7 @@ from acwm_play.export.graphs import NEEDS_TORCH, OnnxStream, check, export_graph
 from acwm_play.layout import Pointing, physics_of
 from acwm_play.simulator import SceneSpec, Simulator
 from acwm_play.worlds import playable
+from acwm_scene.declared import GroupSpec
 from tests.browsing import DESK
 from tests.extras import needs
 from tests.play import follower
@@ -33,6 +35,8 @@ pytestmark = [pytest.mark.ci, needs("onnx")]
 
 
 SIZE = (64, 64)
+
+ABOVE = Camera((0.0, 0.0, 1.0), up=(0.0, 1.0, 0.0), fov=40.0)
 
 OLD = pytest.mark.skipif(torch.__version__ < NEEDS_TORCH, reason=f"needs PyTorch {NEEDS_TORCH}")
 
@@ -84,7 +88,7 @@ def test_the_graphs_of_a_model_that_draws_take_its_noise():
     actions = torch.rand(1, 4, 2) * 2 - 1
     seen = {}
     for seed in (1, 2):
-        draw = drawn_noise((6,), [torch.Generator().manual_seed(seed)]).numpy()
+        draw = noise_of_clips((6,), [torch.Generator().manual_seed(seed)]).numpy()
         stream = OnnxStream(made, given.numpy(), [draw])
         seen[seed] = stream.step(actions[0].numpy())
         truth = world.stream(given, seeds=[seed]).step(actions)[0]
@@ -111,16 +115,17 @@ def test_the_graphs_of_a_model_whose_codec_sees_the_given_frame_take_it():
 @OLD
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "model",
+    ("spec", "noise"),
     [
-        {"name": "planar_bodies", "bodies": 2, "noise": 3},
-        {"name": "drawn_states", "state_size": 4, "following": 2},
-        {"name": "flexible_body", "nodes": [9]},
+        (GroupSpec("bodies", tuple(range(10)), agents=1, bodies=2, camera=ABOVE), 3),
+        (GroupSpec("values", tuple(range(4)), 2), 0),
+        (GroupSpec("nodes", tuple(range(20)), agents=1, nodes=(9,), camera=ABOVE), 0),
     ],
-    ids=lambda model: model["name"],
+    ids=lambda spec: getattr(spec, "kind", None),
 )
-def test_the_graphs_of_a_model_that_moves_a_scene_are_its_stream(model):
-    world = recurrent_world(**model)
+def test_the_graphs_of_a_scene_are_its_stream(spec, noise):
+    scene = {"specs": {spec.kind: spec}, "state_size": len(spec.columns), "noise": noise}
+    world = recurrent_world(name="scene", **scene)
     made = export_graphs(world, SIZE)
     check(made, world, torch.rand(1, 3, *SIZE).numpy(), (torch.rand(24, 2) * 2 - 1).numpy())
 

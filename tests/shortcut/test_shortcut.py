@@ -10,10 +10,10 @@ from torch import nn
 
 from acwm_core.checks import check_model
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
-from acwm_core.model.objectives.objective import Batch
 from acwm_core.recipe import compose
 from acwm_dit.dit import DiT
 from acwm_shortcut.shortcut import ShortcutForcing

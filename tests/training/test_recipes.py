@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from acwm_core.data.generate import generate
-from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
-from acwm_core.recipe import compose
+from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.compose import recipe_names
 from acwm_core.training.fit import fit
 from acwm_formats.arrays import Recording, write_dataset
@@ -77,25 +76,26 @@ def data_of(tmp_path_factory):
         ("push_cube_small", ("codec=identity",)),
         ("push_cube_small", ("objective=diffusion_forcing",)),
         ("push_cube", ("+small", "+recurrent")),
-        ("push_cube", ("+small", "+recurrent", "+planar_bodies")),
-        ("robot_arm", ("+small", "+recurrent", "+drawn_states")),
-        ("push_rope", ("+small", "+recurrent", "+flexible_body")),
-        ("cloth_move", ("+small", "+recurrent", "+flexible_cloth")),
+        ("push_cube", ("+small", "+scene", "codec=compact_reference")),
+        ("robot_arm", ("+small", "+scene")),
+        ("push_rope", ("+small", "+scene")),
+        ("cloth_move", ("+small", "+scene", "data.symmetries=true")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
 )
 def test_two_real_steps(recipe, words, data_of, tmp_path):
     chosen = compose(recipe, words)
     world = chosen.env.name if chosen.env else "push_cube"
-    states = bool(chosen.data.get("states"))
-    agent = ("training.agent_steps=2",) * states
-    takes_two_steps(recipe, (*words, *agent), data_of(world, states), tmp_path)
+    states = chosen.model.name == "scene"
+    motion = ("objective.motion_steps=2",) * states
+    takes_two_steps(recipe, (*words, *motion), data_of(world, states), tmp_path)
 
 
-def test_a_model_of_states_is_refused_without_them(data_of, tmp_path):
-    words = ("+small", "+recurrent", "+drawn_states", "data.states=[]", "training.agent_steps=0")
-    with pytest.raises(RecipeError, match="model=drawn_states learns from states: name them"):
-        takes_two_steps("robot_arm", words, data_of("robot_arm"), tmp_path)
+def test_a_scene_learns_what_its_card_declares(data_of, tmp_path):
+    words = ("+small", "+scene", "codec=compact_reference", "objective.motion_steps=2")
+    run = takes_two_steps("push_cube", words, data_of("push_cube", True), tmp_path)
+    states = ["pusher_position", "cube_present", "cube_position", "cube_yaw"]
+    assert Recipe.from_yaml(run / "recipe.yaml").data["states"] == states
 
 
 def takes_two_steps(recipe, words, data, tmp_path):
@@ -104,3 +104,4 @@ def takes_two_steps(recipe, words, data, tmp_path):
     rows = [row for row in csv.DictReader((run / "metrics.csv").open()) if row["train/loss"]]
     assert [row["step"] for row in rows] == ["0", "1"]
     assert all(math.isfinite(float(row["train/loss"])) for row in rows)
+    return run

@@ -1,4 +1,4 @@
-"""Training on the agent's states: which clips hold them, that it resumes, and what is refused."""
+"""Training on states: which clips hold them, that it resumes, and what is refused."""
 
 from dataclasses import replace
 
@@ -22,10 +22,13 @@ from tests.training.callbacks import Kill
 from tests.training.runs import assert_same, killable, killed_run
 
 PLACES = {"states": ["position"]}
-LEARNER = {
-    "model": {"name": "recurrent", "channels": 4, "width": 8},
-    "objective": {"name": "regression"},
-}
+SCENE = {"name": "scene", "channels": 4, "width": 8, "blocks": 1}
+
+
+def learner(steps=0, **sections):
+    """Sections of a recipe whose model learns for some steps how things move."""
+    objective = {"name": "scene", "motion_steps": steps}
+    return {"model": SCENE, "objective": objective, "data": PLACES, **sections}
 
 
 @pytest.fixture
@@ -77,45 +80,64 @@ def test_what_moves_by_rounding_alone_is_not_magnified(data, monkeypatch):
     assert std[0] > 2
 
 
-def test_a_killed_run_resumes_with_the_same_states(data, tmp_path, monkeypatch):
-    asked = {**LEARNER, "data": PLACES, "training": {"agent_steps": 3}}
+@pytest.mark.parametrize("steps", [0, 3])
+def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkeypatch):
+    asked = learner(steps)
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
     monkeypatch.setattr(Kill, "batch", 7)
     run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
     fit(killable(data, **asked), tmp_path / "unused", resume=run.path)
     assert_same(whole, run)
-    plain = torch.load(
-        RunFolder(fit(killable(data, **LEARNER), tmp_path / "plain")).last_checkpoint,
-        weights_only=True,
-    )["state_dict"]
-    assert not [name for name in plain if "agent" in name]
+
+
+def test_the_scale_of_growing_data_is_that_of_the_start(data, tmp_path, monkeypatch):
+    """A run that was killed goes on with the scale that it began with, whatever data came since."""
+    grown = {"data": {**PLACES, "growing": True, "validation_episodes": 2}}
+    asked = learner(**grown)
+    whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
+    monkeypatch.setattr(Kill, "batch", 7)
+    run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
+    other = torch.full((2,), 5.0), torch.full((2,), 9.0)
+    monkeypatch.setattr(ClipData, "state_scale", lambda self: other)
+    fit(killable(data, **asked), tmp_path / "unused", resume=run.path)
+    assert_same(whole, run)
+
+
+def test_weights_keep_what_their_numbers_mean_on_other_data(data, tmp_path, monkeypatch):
+    """`training.init_from` on data of another scale changes no state that is predicted."""
+    first = fit(tiny_recipe(data, **learner(5, trainer={"max_steps": 2})), tmp_path / "first")
+    scale = load_file(RunFolder(first).weights)["model.groups.values.mean"]
+    assert scale.abs().min() > 0
+    monkeypatch.setattr(ClipData, "state_scale", lambda self: (scale + 9, scale / scale))
+    asked = learner(5, training={"init_from": str(first)}, trainer={"max_steps": 2})
+    second = fit(tiny_recipe(data, **asked), tmp_path / "second")
+    kept = load_file(RunFolder(second).weights)["model.groups.values.mean"]
+    torch.testing.assert_close(kept, scale)
 
 
 def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
     """Positions go on by the actions: a second of steps without pictures finds out how."""
 
-    def trained(name, steps, pictures=2, **sections):
-        asked = {**LEARNER, "data": PLACES, "training": {"agent_steps": steps}, **sections}
-        asked["trainer"] = {"max_steps": pictures}
+    def trained(name, steps, pictures=2):
+        asked = learner(steps, trainer={"max_steps": pictures})
         return RunFolder(fit(tiny_recipe(data, **asked), tmp_path / name))
 
     def weights(run):
         held = load_file(run.weights)
-        return {k: v for k, v in held.items() if "agent.gru" in k or "embedder.mlp" in k}
+        return {k: v for k, v in held.items() if "motion.gru" in k or "embedder.mlp" in k}
 
-    config = DataConfig(str(data), validation_episodes=2, states=tuple(PLACES["states"]))
     episodes = EpisodeDataset(data, "train")
     clips = ClipDataset(episodes, indices=range(6), frames=9, temporal_stride=2, **PLACES)
-    scale = ClipData(config, episodes, TinyCodec(), 0).state_scale()
 
     @torch.no_grad()
     def error(run):
         world = acwm.load(run.path).world_model
-        world.state_mean, world.state_std = scale
         held = clips.inputs(range(len(clips)))
-        return world.motion_loss(**held, random=torch.Generator().manual_seed(0), progress=1).item()
+        random = torch.Generator().manual_seed(0)
+        conditioning = world.condition(held["actions"], 5)
+        return world.model.motion_loss(held["states"], conditioning, random, progress=1).item()
 
-    before, after = trained("before", 0), trained("after", 300)
+    before, after = trained("before", 1), trained("after", 300)
     assert error(after) < 0.1 * error(before)
     longer = trained("longer", 300, pictures=5)
     assert weights(after).keys() == weights(longer).keys() != set()
@@ -123,15 +145,24 @@ def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
         torch.testing.assert_close(value, weights(longer)[name], rtol=0, atol=0)
 
 
+def test_predicted_states_are_those_of_the_card(data, tmp_path):
+    """By name, of every video frame after the given one, in pixels of the tiny world."""
+    run = fit(tiny_recipe(data, **learner(300, trainer={"max_steps": 100})), tmp_path / "run")
+    world = acwm.load(run).world_model
+    episode = EpisodeDataset(data, "train")[0]
+    first = torch.from_numpy(episode.video[0].copy()).permute(2, 0, 1)[None] / 255
+    states = world.predict_states(first, torch.from_numpy(episode.actions[None, :9]))
+    assert states["position"].shape == (1, 8, *episode.states["position"].shape[1:])
+
+
 def test_what_cannot_be_learnt_is_refused(data, mirrored, tmp_path):
     def refused(error: type[AcwmError], said: str, folder=data, **sections):
         with pytest.raises(error, match=said):
-            fit(tiny_recipe(folder, **{**LEARNER, "data": PLACES, **sections}), tmp_path / "run")
+            fit(tiny_recipe(folder, **learner(**sections)), tmp_path / "run")
         assert not (tmp_path / "run").exists()
 
     refused(RecipeError, "has no state 'angle', but position", data={"states": ["angle"]})
     refused(RecipeError, "learns no states", objective={}, model={})
-    refused(RecipeError, "name them", data={}, training={"agent_steps": 3})
     refused(RecipeError, "random_access", data={**PLACES, "reader": "webdataset"})
     card = DatasetCard.read(mirrored)
     silent = Symmetry((1, -2), mirrored=True)

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError, check_shape
+from acwm_core.model.batch import Batch, noise_of_clips, to_device
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, LatentStream
-from acwm_core.model.objectives.objective import Batch, Objective, drawn_noise, sent
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Latent, Sigmas
 
 TRAINING_POINTS = 1000
@@ -74,7 +75,7 @@ class FlowStream(LatentStream, Generic[FlowT]):
 
     def noise(self) -> Latent:
         """Standard normal noise for the next latent frame, `[B, 1, C, h, w]`."""
-        return sent(drawn_noise((1, *self.last.shape[2:]), self.generators), self.last)
+        return to_device(noise_of_clips((1, *self.last.shape[2:]), self.generators), self.last)
 
 
 class FlowMatching(Objective[Denoiser]):
@@ -182,8 +183,8 @@ class FlowMatching(Objective[Denoiser]):
         """
         frames = clean.shape[1] - known
         drawn = torch.stack([self.draw(frames, generator) for generator in generators])
-        noise = sent(drawn_noise(clean.shape[1:], generators), clean)
-        sigma = sent(torch.nn.functional.pad(self._sigmas[drawn], (known, 0)), clean)
+        noise = to_device(noise_of_clips(clean.shape[1:], generators), clean)
+        sigma = to_device(torch.nn.functional.pad(self._sigmas[drawn], (known, 0)), clean)
         noisy = mix(clean, noise, sigma)
         prediction = evaluate(noisy, sigma).float()
         if self.loss_on == "clean":
@@ -191,7 +192,7 @@ class FlowMatching(Objective[Denoiser]):
         else:
             error = self.to_velocity(prediction, noisy, sigma) - (noise - clean)
         per_frame = error[:, known:].square().flatten(2).mean(2)
-        return (per_frame * sent(self._weights[drawn], per_frame)).mean()
+        return (per_frame * to_device(self._weights[drawn], per_frame)).mean()
 
     def sample(
         self,
@@ -219,7 +220,7 @@ class FlowMatching(Objective[Denoiser]):
         points = (steps or self.steps or 1) + 1
         levels = shifted_schedule(points, self.shift)[:, None].repeat(1, frames)
         levels[:, :known] = 0
-        changes, levels = sent(levels.diff(dim=0), latents), sent(levels, latents)
+        changes, levels = to_device(levels.diff(dim=0), latents), to_device(levels, latents)
         for now, change in zip(levels[:-1], changes, strict=True):
             sigma = now.expand(batch, frames)
             velocity = self.to_velocity(evaluate(latents, sigma).float(), latents, sigma)

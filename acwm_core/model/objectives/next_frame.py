@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError
+from acwm_core.model.batch import Batch, to_device
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.flow import Evaluate, FlowMatching, FlowStream, evaluation, mix
-from acwm_core.model.objectives.objective import Batch, sent
 from acwm_core.model.shapes import Latent, Sigmas
 
 
@@ -91,7 +91,7 @@ class NextFrame(FlowMatching):
         past = self._past(model, batch, known)
         levels = torch.stack([torch.rand(frames, generator=each) for each in generators])
         noise = batch.noise(frames)
-        sigma = sent(levels * self.past_noise, latents)
+        sigma = to_device(levels * self.past_noise, latents)
         previous = mix(frames_before(past), noise, sigma)
         after = evaluation(model, batch.conditioning, previous=previous, previous_sigma=sigma)
         return self.error(self.from_change(after, previous), latents, generators, known)
@@ -110,7 +110,7 @@ class NextFrame(FlowMatching):
         given = Batch(latents[:, :known], batch.conditioning, noises)
         with torch.no_grad():
             rollout = self.predict(model, given, latents.shape[1], steps=1)
-        return torch.where(sent(own, latents)[:, None, None, None, None] > 0, rollout, latents)
+        return torch.where(to_device(own, latents)[:, None, None, None, None] > 0, rollout, latents)
 
     def predict(
         self, model: Denoiser, given: Batch, frames: int, steps: int | None = None

@@ -4,19 +4,53 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from acwm_core.errors import RecipeError
-from acwm_core.model.batch import Batch as Batch
-from acwm_core.model.batch import drawn_noise as drawn_noise
-from acwm_core.model.batch import sent as sent
+from acwm_core.model.batch import Batch
+from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, DynamicsModel, InputKind, LatentStream
 from acwm_core.model.shapes import Latent
 
 ModelT = TypeVar("ModelT", bound=DynamicsModel)
+
+
+class TrainingClips(Protocol):
+    """The clips that a run trains on, without their pictures; see `Objective.prepare`.
+
+    Attributes:
+        seed: of the run.
+        shows_progress: whether this process shows how far it is.
+        states: what to learn of the scene, as it was recorded, in the clips of the commonest
+            length, `[N, T, S]` on the device that trains.
+    """
+
+    @property
+    def seed(self) -> int: ...  # noqa: D102
+
+    @property
+    def shows_progress(self) -> bool: ...  # noqa: D102
+
+    @property
+    def states(self) -> Tensor: ...  # noqa: D102
+
+    def state_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the states over all training episodes, `[S]` each.
+
+        Of a value that never changes, the deviation is 1.
+        """
+        ...
+
+    def conditioning(self, rows: Tensor) -> Conditioning:
+        """The embedded actions of some of these N clips, with a gradient."""
+        ...
+
+    def conditioner_parameters(self) -> list[nn.Parameter]:
+        """The weights that embed actions."""
+        ...
 
 
 class Objective(ABC, Generic[ModelT]):
@@ -34,8 +68,7 @@ class Objective(ABC, Generic[ModelT]):
         causal: whether the model has to be causal in time.
         inputs: further latents or levels that it gives a denoiser, by name (`Denoiser.inputs`).
         steps: default number of network evaluations per prediction; None if there is no choice.
-        learns_states: whether it trains on the agent's states too, see `Batch.states`.
-        draws: whether it trains stochastic predictors (`DynamicsModel.samples`).
+        learns_states: whether it trains on states of the scene, too; see `Batch.states`.
     """
 
     trains: type[ModelT]
@@ -43,7 +76,23 @@ class Objective(ABC, Generic[ModelT]):
     inputs: Mapping[str, InputKind] = {}
     steps: int | None = None
     learns_states: bool = False
-    draws: bool = False
+
+    def prepare(self, model: ModelT, clips: TrainingClips, *, resumed: bool) -> None:
+        """Prepare a model before the first step of a training. Optional.
+
+        For what needs no pictures: to measure the data, to teach a part of the model, to freeze it.
+        It is called before the optimiser is built, in all processes alike.
+
+        Args:
+            model: the model to train; its weights are new, or those of `training.init_from`.
+            clips: what it will be trained on.
+            resumed: whether a checkpoint will replace the weights right after; only what is no
+                weight is then to be prepared.
+        """
+
+    def example_model(self, latent_channels: int) -> ModelT | None:
+        """A small model that it trains, for the conformance checks; None for one of theirs."""
+        return None
 
     @abstractmethod
     def loss(self, model: ModelT, batch: Batch, known: int) -> Tensor:
@@ -80,7 +129,7 @@ class Objective(ABC, Generic[ModelT]):
     ) -> Latent:
         """The predicted frames of these numbers alone, `[B, len(only), C, h, w]`; see `predict`.
 
-        Other frames are saved by objectives whose models can (`Predictor.skips`).
+        A model that can saves the work for others; see `Predictor.predict_frames`.
 
         Args:
             only: K for the first frame that is predicted, up to L - 1.
@@ -140,12 +189,6 @@ class Objective(ABC, Generic[ModelT]):
             raise RecipeError(
                 f"{name} needs a model with the further inputs {', '.join(self.inputs)}, which "
                 f"{of} does not take: choose another model or objective=diffusion_forcing"
-            )
-        if self.draws and not model.samples:
-            raise RecipeError(
-                f"{name} needs a model that draws one of several futures, which {of} with these "
-                "parameters does not: set model.noise=32 if it has that parameter, or "
-                "objective=regression"
             )
         if self.causal and not model.causal:
             raise RecipeError(

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from acwm_core.errors import MissingExtraError, RecipeError
+from acwm_core.model.batch import noise_of_clips
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.objectives.objective import drawn_noise
 from acwm_core.model.shapes import Actions, Frame, Latent, Video
 from acwm_core.model.world_model import WorldModel
 
@@ -146,7 +146,7 @@ def noise_size(world: WorldModel) -> int:
 def _draw(world: WorldModel, seed: int) -> tuple[Tensor, ...]:
     """The noise `[1, N]` of a stream with this seed; empty for a model that draws none."""
     noise = noise_size(world)
-    return (drawn_noise((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
+    return (noise_of_clips((noise,), [torch.Generator().manual_seed(seed)]),) if noise else ()
 
 
 def _reference(world: WorldModel, given: Video) -> tuple[Frame, ...]:

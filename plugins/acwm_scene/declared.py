@@ -1,0 +1,203 @@
+"""Which groups a scene has: what the environment's card declares, as the groups' arguments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from acwm_core.env.camera import Camera
+from acwm_core.env.card import EnvironmentCard, StateField
+from acwm_core.env.rotations import FOLDS
+from acwm_core.errors import RecipeError
+
+if TYPE_CHECKING:
+    from acwm_scene.group import Group
+
+Kind = Literal["values", "bodies", "nodes"]
+
+LINES = ("curve", "surface")
+"""Kinds of fields whose rows are the nodes of one body."""
+
+MOST_VALUES = 256
+"""Most numbers of a field that is taken for values without having been asked for."""
+
+UNITS = {"bodies": 4.2, "nodes": 10.0}
+"""Units from the middle of the picture to its upper edge where none are given: a body is about a
+unit large, and nodes are a fraction of one apart."""
+
+
+def unit_of(camera: Camera, kind: Kind) -> float:
+    """Metres that count as one in a group of this kind, by what the camera sees."""
+    half = camera.half_height
+    if half is None:
+        half = math.dist(camera.eye, camera.target) * math.tan(math.radians(camera.fov) / 2)
+    return half / UNITS[kind]
+
+
+@dataclass(frozen=True)
+class GroupSpec:
+    """A group of a scene.
+
+    Attributes:
+        kind: of the group.
+        columns: which of the values of the states are its own, in the order of the kind: of values
+            those that follow from others last; of bodies the agents' places, presence, places and
+            angles; of nodes the agents' places and those of the nodes.
+        following: how many values follow from the others.
+        angles: which of the values, by their place among `columns`, are angles in rad.
+        agents: number of agents, which the actions move.
+        bodies: number of bodies, which agents push.
+        folds: in how many ways a body can be turned and look the same.
+        has_presence: whether it is recorded which bodies there are.
+        axes: coordinates of each place, 2 or 3.
+        nodes: number of nodes along each side of a rope or cloth.
+        camera: of the card.
+        light: direction to the light whose shadows on the ground z = 0 are seen, if any.
+    """
+
+    kind: Kind
+    columns: tuple[int, ...]
+    following: int = 0
+    angles: tuple[int, ...] = ()
+    agents: int = 0
+    bodies: int = 0
+    folds: int = 1
+    has_presence: bool = False
+    axes: int = 2
+    nodes: tuple[int, ...] = ()
+    camera: Camera | None = None
+    light: tuple[float, float, float] | None = None
+
+    def build(self, **options: Any) -> Group:
+        """The group, with fresh weights."""
+        # Imported here, as groups take their specs from this module.
+        if self.kind == "values":
+            from acwm_scene.values import ValueGroup as Kind
+        elif self.kind == "bodies":
+            from acwm_scene.bodies import BodyGroup as Kind
+        else:
+            from acwm_scene.node_group import NodeGroup as Kind
+        return Kind(self, **options)
+
+
+def groups_of(card: EnvironmentCard, states: Sequence[str]) -> dict[str, Any]:
+    """The arguments `specs` and `state_size` of a scene that learns these fields of the state.
+
+    Nodes are the fields that are a curve or a surface. Bodies are the fields of positions and
+    angles of the same instances, and what says which of these exist. With either, and without
+    values, positions of other instances are the agents. All else is values.
+
+    Raises:
+        RecipeError: there are no states to learn from.
+    """
+    if not states:
+        raise RecipeError(
+            "a scene learns from states: name them in data.states, or choose a model that needs "
+            "none, such as by +recurrent"
+        )
+    starts, size = dict[str, int](), 0
+    for name in states:
+        starts[name] = size
+        size += math.prod(card.fields[name].shape)
+    chosen, columns = [card.fields[name] for name in states], _Columns(starts)
+    spec = _nodes(chosen, columns, card) or _bodies(chosen, columns, card)
+    specs = {spec.kind: spec} if spec else {}
+    rest = [each for each in chosen if not spec or each.name not in columns.taken]
+    if rest:
+        specs["values"] = _values(rest, columns)
+    return {"specs": specs, "state_size": size}
+
+
+def default_states(card: EnvironmentCard, changing: Collection[str]) -> tuple[str, ...]:
+    """The fields of the state that a scene learns if nobody chooses: what moves, and moves it.
+
+    Nodes or bodies and their agents, if the card declares any; else all that changes.
+
+    Args:
+        card: of the environment.
+        changing: names of the fields that change within episodes.
+    """
+    things = [each for each in card.state if each.name in changing]
+    things += [each for each in card.state if each.name in {thing.present for thing in things}]
+    places = [each for each in things if each.kind in ("position", "angle", "presence", *LINES)]
+    columns = _Columns(dict.fromkeys((each.name for each in places), 0))
+    if _nodes(places, columns, card) or _bodies(places, columns, card):
+        return tuple(each.name for each in card.state if each.name in columns.taken)
+    sizes = {each.name: math.prod(each.shape) for each in things}
+    return tuple(each.name for each in card.state if 0 < sizes.get(each.name, 0) <= MOST_VALUES)
+
+
+class _Columns:
+    """Numbers of the values of fields among all states, and which fields were asked for."""
+
+    def __init__(self, starts: dict[str, int]) -> None:
+        self._starts, self.taken = starts, set[str]()
+
+    def of(self, *fields: StateField) -> tuple[int, ...]:
+        self.taken |= {each.name for each in fields}
+        return tuple(
+            self._starts[each.name] + number
+            for each in fields
+            for number in range(math.prod(each.shape))
+        )
+
+
+def _values(fields: Sequence[StateField], columns: _Columns) -> GroupSpec:
+    names = {each.name for each in fields}
+    following = [each for each in fields if each.follows and {*each.follows} <= names]
+    moved = [each for each in fields if each not in following]
+    ordered, angles, place = [*moved, *following], list[int](), 0
+    for each in ordered:
+        size = math.prod(each.shape)
+        if each.kind == "angle":
+            angles += range(place, place + size)
+        place += size
+    count = sum(math.prod(each.shape) for each in following)
+    return GroupSpec("values", columns.of(*ordered), count, tuple(angles))
+
+
+def _nodes(
+    fields: Sequence[StateField], columns: _Columns, card: EnvironmentCard
+) -> GroupSpec | None:
+    lines = [each for each in fields if each.kind in LINES]
+    if len(lines) != 1 or card.camera is None:
+        return None
+    axes = lines[0].shape[-1]
+    agents = [each for each in fields if each.kind == "position" and each.entries == axes]
+    if not agents:
+        return None
+    return GroupSpec(
+        "nodes",
+        columns.of(*agents, lines[0]),
+        agents=sum(each.rows for each in agents),
+        axes=axes,
+        nodes=lines[0].grid,
+        camera=card.camera,
+        light=card.light if axes == 3 else None,
+    )
+
+
+def _bodies(
+    fields: Sequence[StateField], columns: _Columns, card: EnvironmentCard
+) -> GroupSpec | None:
+    angles = {each.owners: each for each in fields if each.kind == "angle" and each.owners}
+    positions = [each for each in fields if each.kind == "position"]
+    bodies = [each for each in positions if each.owners in angles]
+    agents = [each for each in positions if each.owners not in angles and each.entries == 2]
+    if len(bodies) != 1 or not agents or card.camera is None:
+        return None
+    body = bodies[0]
+    angle = angles[body.owners]
+    present = [each for each in fields if each.name == body.present]
+    return GroupSpec(
+        "bodies",
+        columns.of(*agents, *present, body, angle),
+        agents=sum(each.rows for each in agents),
+        bodies=body.rows,
+        folds=FOLDS[angle.symmetry],
+        has_presence=bool(present),
+        axes=body.entries,
+        camera=card.camera,
+    )

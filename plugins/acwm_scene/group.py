@@ -1,0 +1,177 @@
+"""The interface of the groups of a scene: what is read, moved and drawn alike."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.utils import _pytree
+
+from acwm_core.model.shapes import Latent
+
+Tree = TypeVar("Tree")
+"""A tensor, or a named tuple, tuple or dict of trees."""
+
+
+def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
+    """The tree with a function applied to each tensor, and to those in its place in the others."""
+    return cast(Any, _pytree).tree_map(function, tree, *others)
+
+
+def at_frame(course: Tree, frame: int) -> Tree:
+    """One frame of a course, whose tensors are `[B, T, …]`."""
+    return tree_map(lambda values: values[:, frame], course)
+
+
+def stacked(frames: Sequence[Tree]) -> Tree:
+    """Several frames as a course."""
+    return tree_map(lambda *values: torch.stack(values, 1), *frames)
+
+
+def picked(course: Tree, numbers: Tensor) -> Tree:
+    """The frames `[B, …]` of a course; numbers below 0 stand for the first one."""
+    rows = torch.arange(len(numbers), device=numbers.device)
+    rows = rows.view(-1, *[1] * (numbers.ndim - 1))
+    return tree_map(lambda values: values[rows, numbers.clamp(min=0)], course)
+
+
+def flattened(course: Tree) -> Tree:
+    """The first two axes as one."""
+    return tree_map(lambda values: values.flatten(0, 1), course)
+
+
+def energy_score(
+    draws: tuple[Tree, Tree], true: Tree, distance: Callable[[Tree, Tree], Tensor]
+) -> Tensor:
+    """The energy score of two draws (Gneiting and Raftery 2007, eq. 22), a scalar.
+
+    ½ (‖x₁ − y‖ + ‖x₂ − y‖) − ½ ‖x₁ − x₂‖. Its expectation is least if draws have the distribution
+    of the true futures.
+    """
+    first, second = draws
+    return (distance(first, true) + distance(second, true) - distance(first, second)) / 2
+
+
+class Group(nn.Module, ABC):
+    """One kind of things in a scene: its reader, its mover and its painter.
+
+    A *frame* is how the things are in one video frame, and a *course* in several: a tree of tensors
+    `[B, …]` and `[B, T, …]`. A *state* is what moving them needs, in one video frame.
+
+    Attributes:
+        noise: numbers that a draw of their future depends on; 0 if there is one future.
+        is_prepared: whether it knows the scale of its states.
+    """
+
+    noise: int = 0
+
+    @property
+    def is_prepared(self) -> bool:
+        return True
+
+    def prepare(self, mean: Tensor, std: Tensor) -> None:
+        """Take the scale of its states, `[S]` each; for groups that need one."""
+
+    @abstractmethod
+    def encode(self, states: Tensor) -> Any:
+        """The course in states `[B, T, S]`, as they were recorded."""
+
+    @abstractmethod
+    def decode(self, course: Any) -> Tensor:
+        """The inverse of `encode`; NaN where nothing tells a value."""
+
+    @abstractmethod
+    def read(self, given: Latent) -> Any:
+        """The state that the last of the given latent frames `[B, K, C, h, w]` shows."""
+
+    @abstractmethod
+    def begin(self, frame: Any, previous: Any) -> Any:
+        """The state of things that are so, and were as in `previous` in the video frame before."""
+
+    @abstractmethod
+    def frame(self, state: Any) -> Any:
+        """How things are in a state."""
+
+    def past(self, state: Any, frames: int) -> Any:
+        """The course of the last video frames until a state, the last one first; all alike."""
+        return stacked([self.frame(state)] * frames)
+
+    def with_draw(self, state: Any, draw: Tensor) -> Any:
+        """The state with the numbers `[B, noise]` that its future depends on."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def embed(self, modulation: Tensor) -> Tensor:
+        """Embedded actions `[B, L, width]` by video frames, `[B, L · stride, …]`."""
+
+    @abstractmethod
+    def move(self, state: Any, action: Tensor) -> Any:
+        """The state one video frame later.
+
+        Args:
+            state: in the video frame before.
+            action: one of the rows of `embed`, `[B, …]`.
+        """
+
+    @abstractmethod
+    def canvas(self, features: Tensor, past: Any) -> tuple[Tensor, Any]:
+        """What its painter adds to what all frames start from, and what it remembers.
+
+        Args:
+            features: of the cells of the given latent frame, `[B, channels, h, w]`.
+            past: the course of its video frames, the last one first, `[B, stride, …]`.
+
+        Returns:
+            `[B, channels, h, w]`, and a tree of tensors `[B, …]` for `paint`.
+        """
+
+    @abstractmethod
+    def paint(self, memory: Any, shown: Any, size: torch.Size) -> tuple[Tensor, Tensor]:
+        """What its painter adds to a latent frame.
+
+        Args:
+            memory: what `canvas` returned.
+            shown: the course of its video frames, the last one first, `[B, stride, …]`.
+            size: rows and columns of cells.
+
+        Returns:
+            A map `[B, channels, h, w]`, and the vector `[B, width]` that modulates the blocks.
+        """
+
+    def as_read(self, base: Tensor, course: Any) -> Any:
+        """A true course as drawing is learnt from it: while training, as wrong as it is read.
+
+        Args:
+            base: the latent frame that shows the first frame of the course, `[B, C, h, w]`.
+            course: `[B, T, …]`.
+        """
+        return course
+
+    @abstractmethod
+    def reading_loss(self, latents: Tensor, true: Any) -> Tensor:
+        """The error of what it reads from latent frames `[N, C, h, w]`, a scalar.
+
+        Args:
+            latents: the frames.
+            true: how things are in their last video frames, `[N, …]`.
+        """
+
+    @abstractmethod
+    def motion_loss(
+        self, states: Tensor, actions: Tensor, random: Generator, progress: float
+    ) -> Tensor:
+        """The error of how it moves things, without pictures, a scalar.
+
+        Args:
+            states: of clips, as they were recorded, `[B, T, S]`.
+            actions: what `embed` makes of their actions.
+            random: a CPU generator, the only source of randomness.
+            progress: share of the training that is over, 0 to 1; short windows come first.
+        """
+
+    @abstractmethod
+    def movers(self) -> Sequence[nn.Module]:
+        """The modules that move things."""
