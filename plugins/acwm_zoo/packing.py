@@ -66,14 +66,17 @@ def pack(
     folder = RunFolder(run)
     codec = [each for each in overrides if each.split("=")[0].split(".")[0] == "codec"]
     overrides = [each for each in overrides if each not in codec]
-    recipe, facts = load_run(run).recipe, read_metadata(folder.weights)
+    recipe, _, world_model = load_run(run)
+    facts = read_metadata(folder.weights)
     if codec:
         recipe = _with_codec(recipe, codec, facts["codec"], run)
     recipe = Recipe.from_dict(with_overrides(recipe.to_dict(), overrides))
     weights = cast(dict[str, torch.Tensor], cast(Any, load_file)(folder.weights))
     with writing(out), made_whole(out) as partial:
         packed = RunFolder(partial)
-        rounded = {name: value.bfloat16() for name, value in weights.items()}
+        trained = {name for name, _ in world_model.named_parameters()}
+        # What was measured, such as the scale of states, keeps its precision.
+        rounded = {n: v.bfloat16() if n in trained else v for n, v in weights.items()}
         details = {n: v for n, v in facts.items() if n not in ("format", "codec", "step", "sha256")}
         details |= training_of(folder)
         save_weights(packed.weights, rounded, facts["codec"], facts["step"], **details)
