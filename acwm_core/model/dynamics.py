@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 from torch import Generator, Tensor, nn
 
@@ -58,6 +58,7 @@ class DynamicsModel(nn.Module, ABC):
         causal: whether the prediction of a latent frame depends on no later frame.
         samples: whether a prediction depends on the clip's noise generator, so that other seeds
             give other futures. Otherwise there is one future for all seeds.
+        fitted_parameters: names of what `fitted` returns beside `latent_channels`.
     """
 
     width: int
@@ -65,6 +66,7 @@ class DynamicsModel(nn.Module, ABC):
     heads: int
     causal: bool = False
     samples: bool = False
+    fitted_parameters: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def fitted(cls, data: ModelInputs) -> dict[str, Any]:

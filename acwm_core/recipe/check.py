@@ -24,10 +24,11 @@ SECTIONS = {
 are checked without importing torch."""
 
 FITTED = {
-    "model": ("latent_channels", "temporal_stride", "state_size"),
+    "model": ("latent_channels",),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads", "widths"),
 }
-"""Parameters that follow from the other components and the dataset, never from a recipe."""
+"""Parameters that follow from the other components and the dataset, never from a recipe. A component
+may name further ones in its attribute `fitted_parameters`."""
 
 
 def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -108,7 +109,8 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
         takes = _signature_of(component)
     shared = {name: value for name, value in inherited.items() if name in takes.parameters}
     values = {**component.defaults, **shared, **params}
-    return {"name": component.name, **_check(section, takes, values, FITTED.get(section, ()))}
+    fitted = (*FITTED.get(section, ()), *_fitted_by(component))
+    return {"name": component.name, **_check(section, takes, values, fitted)}
 
 
 def check_metric_params(where: str, metric: str, params: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,6 +158,13 @@ def _without_retired(
                 f"{name!r} any more, and does what {types.show(kept)} did"
             )
     return {name: value for name, value in params.items() if name not in component.retired}
+
+
+def _fitted_by(component: Component) -> tuple[str, ...]:
+    """The further parameters of a component that never come from a recipe."""
+    if component.kind != "model" or component.missing_modules():
+        return ()
+    return getattr(component.load(), "fitted_parameters", ())
 
 
 def _signature_of(component: Component) -> Signature:

@@ -80,6 +80,7 @@ def _component(component: Component) -> list[str]:
     anchor = f"{component.kind}-{component.name}"
     fitted = {"environment": _EVERY_WORLD, **FITTED}.get(component.kind, ())
     takes = component.kind not in ("trained_model", "protocol")
+    fitted = (*fitted, *(getattr(component.load(), "fitted_parameters", ()) if takes else ()))
     rows = _parameters(component.load(), component.defaults, fitted) if takes else ()
     return [
         f"### {component.name} {{: #{anchor} }}",

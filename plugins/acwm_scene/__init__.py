@@ -1,1 +1,1 @@
-"""Dynamics models that predict the next latent frame in one pass, from a recurrent state."""
+"""Dynamics models that predict the next latent frame in one pass: from a scene, or a grid."""

@@ -70,6 +70,7 @@ class SceneDynamics(Predictor):
 
     layers, heads = 0, 1
     causal = True
+    fitted_parameters = ("temporal_stride", "specs", "state_size")
 
     def __init__(
         self,
