@@ -168,4 +168,4 @@ def test_what_cannot_be_learnt_is_refused(data, mirrored, tmp_path):
     silent = Symmetry((1, -2), mirrored=True)
     replace(card, environment=replace(card.environment, symmetries=(silent,))).write(mirrored)
     both = {**PLACES, "symmetries": True}
-    refused(DataError, "does not say how it transforms position", folder=mirrored, data=both)
+    refused(DataError, "transforms position: leave out", folder=mirrored, data=both)
