@@ -47,7 +47,7 @@ def recipe_keys() -> list[str]:
     for section, target in SECTIONS.items():
         found += [f"{section}.{key}" for key in signature(resolve_name(target)).parameters]
     for kind in ("objective", "executor"):
-        for name, (target, _) in OWN[kind].items():
+        for name, (target, *_) in OWN[kind].items():
             taken = signature(resolve_name(f"acwm_core.{target}")).parameters
             found += [f"{kind}={name} {kind}.{key}" for key in taken]
     return sorted(found)

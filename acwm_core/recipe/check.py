@@ -27,8 +27,8 @@ FITTED = {
     "model": ("latent_channels",),
     "conditioner": ("action_size", "temporal_stride", "width", "layers", "heads", "widths"),
 }
-"""Parameters that follow from the other components and the dataset, never from a recipe. A component
-may name further ones in its attribute `fitted_parameters`."""
+"""Parameters that follow from the other components and the dataset, never from a recipe. A model
+may name further ones in `fitted_parameters`."""
 
 
 def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
