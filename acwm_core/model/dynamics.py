@@ -25,13 +25,14 @@ class ModelInputs(NamedTuple):
     Attributes:
         latent_channels: channels C of the codec's latents.
         temporal_stride: video frames per latent frame of the codec.
-        environment: the card of the environment that the data shows.
+        environment: the card of the environment that the data shows; None if it is unknown, as for
+            a checkpoint of another program.
         states: names of the fields of its state to learn, in their order (`data.states`).
     """
 
     latent_channels: int
     temporal_stride: int
-    environment: EnvironmentCard
+    environment: EnvironmentCard | None = None
     states: tuple[str, ...] = ()
 
 

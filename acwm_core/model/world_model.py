@@ -176,12 +176,12 @@ class WorldModel(nn.Module):
 
     def named_states(self, values: Tensor) -> dict[str, Tensor]:
         """States `[B, T, S]` as the fields that they are, `[B, T, …]` by name."""
-        sizes = [math.prod(shape) for shape in self.state_shapes.values()]
-        fields = zip(self.state_shapes.items(), values.split(sizes, 2), strict=True)
-        return {
-            name: part.unflatten(2, shape or (1,)).reshape(*part.shape[:2], *shape)
-            for (name, shape), part in fields
-        }
+        named, start = dict[str, Tensor](), 0
+        for name, shape in self.state_shapes.items():
+            part = values[..., start : start + math.prod(shape)]
+            named[name] = part.reshape(*values.shape[:2], *shape)
+            start += math.prod(shape)
+        return named
 
     @property
     def predicts_states(self) -> bool:

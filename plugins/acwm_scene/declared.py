@@ -82,7 +82,7 @@ class GroupSpec:
         return Kind(self, **options)
 
 
-def groups_of(card: EnvironmentCard, states: Sequence[str]) -> dict[str, Any]:
+def groups_of(card: EnvironmentCard | None, states: Sequence[str]) -> dict[str, Any]:
     """The arguments `specs` and `state_size` of a scene that learns these fields of the state.
 
     Nodes are the fields that are a curve or a surface. Bodies are the fields of positions and
@@ -92,7 +92,7 @@ def groups_of(card: EnvironmentCard, states: Sequence[str]) -> dict[str, Any]:
     Raises:
         RecipeError: there are no states to learn from.
     """
-    if not states:
+    if card is None or not states:
         raise RecipeError(
             "a scene learns from states: name them in data.states, or choose a model that needs "
             "none, such as by +recurrent"

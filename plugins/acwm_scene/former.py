@@ -38,7 +38,8 @@ class Former(SceneDynamics):
     @classmethod
     def fitted(cls, data: ModelInputs) -> dict[str, Any]:
         """The codec's facts, and the number of values of the states."""
-        fields = {each.name: math.prod(each.shape) for each in data.environment.state}
+        state = data.environment.state if data.environment else ()
+        fields = {each.name: math.prod(each.shape) for each in state}
         return {
             "latent_channels": data.latent_channels,
             "temporal_stride": data.temporal_stride,

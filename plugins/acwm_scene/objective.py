@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from acwm_core.errors import RecipeError
 from acwm_core.model.batch import Batch
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, Predictor
 from acwm_core.model.objectives.objective import Objective, TrainingClips
 from acwm_core.model.objectives.regression import Regression, frames_of
 from acwm_scene.motion_training import learn_motion
@@ -53,19 +53,21 @@ class SceneObjective(Regression):
         """Refuse what is no scene; a scene may draw futures, as its motion learns by them."""
         Objective.check_model(self, model)
 
-    def prepare(self, model: SceneDynamics, clips: TrainingClips, *, resumed: bool) -> None:
+    def prepare(self, model: Predictor, clips: TrainingClips, *, resumed: bool) -> None:
         """Take the scale of the states unless the weights have one, and learn the motion."""
+        assert isinstance(model, SceneDynamics)
         model.prepare(*clips.state_scale())
         if self.motion_steps:
             learn_motion(model, clips, 0 if resumed else self.motion_steps)
 
-    def loss(self, model: SceneDynamics, batch: Batch, known: int) -> Tensor:
+    def loss(self, model: Predictor, batch: Batch, known: int) -> Tensor:
         """The error of the drawn latents and of what is read; see `Objective.loss`.
 
         Without states, as in validation, the error of what it predicts by itself.
         """
         if batch.states is None:
             return super().loss(model, batch, known)
+        assert isinstance(model, SceneDynamics)
         frames = batch.latents.shape[1]
         numbers = self.compared_frames(model, batch, known)
         if numbers is None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from acwm_core.errors import DataError, PluginError
 from acwm_core.model.build import build_conditioner, build_model, build_objective
 from acwm_core.model.conditioner import Conditioner
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, ModelInputs
 from acwm_core.recipe import Recipe
 from acwm_core.recipe.compose import merge, read_recipe, recipe_folder, with_overrides
 
@@ -104,9 +104,8 @@ def convert(checkpoint: ForeignModel, recipe: Recipe) -> State:
         PluginError: the importer's state dicts do not fit the model and conditioner.
     """
     with torch.device("meta"):
-        model = build_model(
-            recipe.model, build_objective(recipe.objective), checkpoint.latent_channels
-        )
+        inputs = ModelInputs(checkpoint.latent_channels, checkpoint.temporal_stride)
+        model = build_model(recipe.model, build_objective(recipe.objective), inputs)
         conditioner = build_conditioner(
             recipe.conditioner, model, checkpoint.action_size, checkpoint.temporal_stride
         )
