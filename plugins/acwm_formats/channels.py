@@ -66,6 +66,11 @@ def _is_full(values: NDArray[Any]) -> bool:
     return bool((values == values.flat[0]).all()) and float(values.flat[0]) in (1.0, 255.0)
 
 
+def named(name: str, channels: Channels | None) -> Channels | None:
+    """What the user says that channels are, or the name of their array."""
+    return channels or ("rgba" if "rgba" in name.lower() else None)
+
+
 def coloured(image: NDArray[Any], channels: Channels) -> NDArray[Any]:
     """A frame of three or four channels as colours: of a stack, the newest moment in grey."""
     shown = channels_last(image)

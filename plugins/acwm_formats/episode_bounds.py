@@ -17,14 +17,22 @@ Bounds = list[tuple[int, int]]
 _WHOSE = ("ep", "eps", "episode", "episodes", "traj", "trajs", "trajectory", "demo", "rollout")
 
 
+_ALSO = ("seq", "sequence", "path", "run", "clip", "game")
+
+
 def _names(*parts: str) -> frozenset[str]:
-    joined = (f"{whose}_{part}" for whose, part in itertools.product(_WHOSE, parts))
-    return frozenset(joined)
+    whose = (*_WHOSE, *_ALSO)
+    return frozenset(f"{each}_{part}" for each, part in itertools.product(whose, parts))
 
 
 LENGTHS = _names("len", "lens", "length", "lengths", "size", "sizes") | {"lengths"}
 STARTS = _names("offset", "offsets", "start", "starts", "begin", "begins", "from")
 ENDS = _names("end", "ends", "stop", "stops", "to")
+EDGES = _names("bounds", "boundaries", "range", "ranges", "slices", "limits")
+COUNTERS = frozenset(
+    {"step", "step_idx", "step_index", "timestep", "timesteps", "time_step", "time_steps"}
+    | {"frame", "frame_idx", "frame_index", "frame_id"}
+)
 NUMBERS = _names("idx", "idxs", "index", "indices", "id", "ids", "num", "number", "no") | {
     *_WHOSE,
     "trajectories",
@@ -35,6 +43,8 @@ LAST = frozenset(
     for plural in ("", "s")
 ) | {"terminated", "truncated", "is_terminal", "last"}
 FIRST = frozenset({"is_first", "first"})
+INDEX = ("episode_data_index", "episodes", "episode", "meta")
+"""Groups that say where episodes are, in which a name such as ``from`` is that of an episode."""
 
 
 def plain(name: str) -> str:
@@ -44,7 +54,12 @@ def plain(name: str) -> str:
 
 def divides(name: str) -> bool:
     """Whether an array of this name says where episodes begin or end, not what is in them."""
-    return plain(name) in LENGTHS | STARTS | ENDS
+    return plain(name) in LENGTHS | STARTS | ENDS | EDGES
+
+
+def tells(name: str) -> bool:
+    """Whether an array of this name may tell episodes apart, in whatever way."""
+    return divides(name) or plain(name) in NUMBERS | LAST | FIRST | COUNTERS
 
 
 def bounds_of(
@@ -62,12 +77,14 @@ def bounds_of(
         DataError: they contradict each other or the number of rows.
     """
     arrays = {plain(name): np.asarray(values) for name, values in found.items()}
+    for name in [name for name in arrays if name in EDGES]:
+        arrays |= _as_starts_and_ends(arrays.pop(name))
     flat = {name: v for name, v in arrays.items() if v.ndim == 1 or v.shape[1:] == (1,)}
     known = {name: v.reshape(-1) for name, v in flat.items() if v.dtype.kind in "biufSUO"}
     whole = {name: v for name, v in known.items() if v.dtype.kind in "iuf" and len(v)}
     edges = _edges(whole, count) or _runs(known, count, where)
     if edges is None and flags:
-        edges = _flagged(known, count)
+        edges = _flagged(known, count) or _counted(whole, count)
     if edges is None:
         return None
     ordered = sorted(edges)
@@ -81,6 +98,15 @@ def bounds_of(
     return edges if len(edges) > 1 else None
 
 
+def _as_starts_and_ends(edges: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Pairs of a first row and the row after the last, or all such rows in a list."""
+    if edges.ndim == 2 and edges.shape[1] == 2:
+        return {"episode_starts": edges[:, 0], "episode_ends": edges[:, 1]}
+    if edges.ndim == 1 and len(edges) > 1 and edges[0] == 0:
+        return {"episode_starts": edges[:-1], "episode_ends": edges[1:]}
+    return {"episode_ends": edges}
+
+
 def _edges(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
     """Told by lengths, starts or ends."""
     lengths, starts, ends = (
@@ -92,7 +118,9 @@ def _edges(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
         if len(first) == len(lengths):
             return list(zip(first.tolist(), (first + lengths).tolist(), strict=True))
     if ends is not None and len(ends) < count:
-        stops = ends + 1 if int(ends[-1]) == count - 1 else ends  # of the last row, or after it
+        stops = ends + 1 if int(ends.max()) == count - 1 else ends  # of the last row, or after it
+        if starts is not None and len(starts) == len(ends):
+            return list(zip(starts.tolist(), stops.tolist(), strict=True))
         return list(itertools.pairwise([0, *stops.tolist()]))
     if starts is not None and len(starts) < count:
         return list(itertools.pairwise([*starts.tolist(), count]))
@@ -123,4 +151,15 @@ def _flagged(known: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
         ended = np.any(last, axis=0)
         stops = np.flatnonzero(ended & ~np.append(ended[1:], False)) + 1
         return list(itertools.pairwise([0, *stops[stops < count].tolist(), count]))
+    return None
+
+
+def _counted(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
+    """Told by a number of the row in its episode, which counts up by one and begins anew."""
+    for name, values in whole.items():
+        if name in COUNTERS and len(values) == count > 1:
+            steps = np.diff(values)
+            starts = np.flatnonzero(steps != 1) + 1
+            if (values[starts] == values[0]).all():
+                return list(itertools.pairwise([0, *starts.tolist(), count]))
     return None

@@ -32,9 +32,20 @@ from acwm_formats.hdf5_layouts import (
     files_of,
     layout_of,
     opened,
+    partial_in,
 )
 from acwm_formats.hdf5_recordings import HDF5Recordings, Place
-from acwm_formats.names import exact, is_action, pair, text_note, typed, word, words
+from acwm_formats.names import (
+    exact,
+    is_action,
+    natural,
+    pair,
+    text_note,
+    typed,
+    unread_note,
+    word,
+    words,
+)
 from acwm_formats.sources import guarded
 from acwm_formats.timeline import (
     ActionFacts,
@@ -119,7 +130,7 @@ class HDF5(Format):
             actions=_action(card, layout),
             state=card.state if card and states is None else None,
             instances=_instances(card),
-            notes=_notes(first, layout, splits, stated=rate is not None),
+            notes=_notes(root, files, layout, splits, stated=rate is not None),
             summary=card.summary if card else f"Recorded in the layout of {layout.name}",
         )
 
@@ -219,6 +230,9 @@ def _contents(path: Path, layout: Layout) -> tuple[list[Place], dict[str, Split]
     with opened(path) as file:
         names = episodes_in(file, layout)
         places = [place for name in names for place in _places(path, file, name, names, layout)]
+        if layout.is_robosuite and names:  # opening one will tell what it lacks
+            places += [Place(path, name) for name in partial_in(file, layout)]
+            places.sort(key=lambda place: natural(place.group))
         return places, _tests(file)
 
 
@@ -227,9 +241,10 @@ def _places(
 ) -> Iterator[Place]:
     """The episodes in a group: one, or several in a row."""
     bounds = None
-    if layout.name != "acwm" and not (layout.is_robosuite and layout.actions == "actions"):
+    if layout.name != "acwm":
         count = len(array(file[name], layout.actions))
-        bounds = bounds_in(file[name], count, alone=len(names) == 1)
+        alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
+        bounds = bounds_in(file[name], count, alone=alone)
         for where in (*layout.cameras.values(), *layout.states.values()) if bounds else ():
             if (other := len(array(file[name], where))) != count:
                 raise DataError(f"{where} of {path} has {other} rows, and the actions have {count}")
@@ -240,11 +255,22 @@ def _places(
 
 
 def _notes(
-    path: Path, layout: Layout, splits: Recordings | Mapping[Split, Recordings], *, stated: bool
+    root: Path,
+    files: Sequence[Path],
+    layout: Layout,
+    splits: Recordings | Mapping[Split, Recordings],
+    *,
+    stated: bool,
 ) -> tuple[str, ...]:
     """What people should know about how the files were read."""
     notes = [layout.note] if layout.note and not stated else []
-    with opened(path) as file:
+    notes += unread_note(root, files)
+    for path in () if layout.name == "acwm" or layout.is_robosuite else files:
+        with contextlib.suppress(DataError), opened(path) as file:
+            if lacking := partial_in(file, layout):
+                what = " and ".join((layout.actions, *layout.cameras.values()))
+                notes.append(f"Groups of {path.name} without {what}: {', '.join(lacking[:5])}.")
+    with opened(first_sound(files, _closed)) as file:
         if names := episodes_in(file, layout):
             group = file[names[0]]
             others = [n for n in group if is_action(n) and n != layout.actions]

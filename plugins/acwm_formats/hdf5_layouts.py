@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -16,15 +17,7 @@ from acwm_core.arrays import check_unpacked
 from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched
-from acwm_formats.episode_bounds import (
-    FIRST,
-    LAST,
-    NUMBERS,
-    Bounds,
-    bounds_of,
-    divides,
-    plain,
-)
+from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, tells
 from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import natural
@@ -144,6 +137,17 @@ def episodes_in(file: Any, layout: Layout) -> list[str]:
     return sorted(found, key=natural)
 
 
+def partial_in(file: Any, layout: Layout) -> list[str]:
+    """The groups that hold a part of what the layout names, and so are no episode."""
+    if layout.is_robosuite:
+        wanted = [name for name in _groups(file) if re.fullmatch(r"data/[^/]+", name)]
+    else:
+        paths = (layout.actions, *layout.cameras.values())
+        wanted = [n for n in _groups(file) if n != "/" and any(path in file[n] for path in paths)]
+    whole = episodes_in(file, layout)
+    return sorted({*wanted} - {*whole}, key=natural)
+
+
 def _groups(file: Any) -> Iterator[str]:
     yield "/"
     names: list[str] = []
@@ -219,8 +223,7 @@ def _in_a_row(group: Any) -> Layout | None:
 
 def is_bound(name: str, actions: str) -> bool:
     """Whether an array is the actions or says where episodes are, and so is no state."""
-    bare = plain(name)
-    return name == actions or divides(name) or bare in NUMBERS | LAST | FIRST | {"step_idx"}
+    return name == actions or tells(name)
 
 
 def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
@@ -238,12 +241,16 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
         DataError: arrays contradict each other.
     """
     for place in (group, group.parent, group.file) if alone else (group,):
-        beside = place.get("meta")
-        for part in (place, *([beside] if isinstance(beside, h5py.Group) else [])):
+        parts = [("", place), *((name, place.get(name)) for name in INDEX)]
+        for prefix, part in parts:
+            if not _is_group(part):
+                continue
             found = {
-                name: content(item)
+                _qualified(prefix, name): content(item)
                 for name, item in part.items()
-                if isinstance(item, h5py.Dataset) and item.ndim in (1, 2) and _tells(name)
+                if isinstance(item, h5py.Dataset)
+                and item.ndim in (1, 2)
+                and tells(_qualified(prefix, name))
             }
             where = f"{group.file.filename} ({', '.join(found)})"
             if found and (bounds := bounds_of(found, count, where, flags=alone)):
@@ -251,8 +258,9 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
     return None
 
 
-def _tells(name: str) -> bool:
-    return divides(name) or plain(name) in NUMBERS | LAST | FIRST
+def _qualified(group: str, name: str) -> str:
+    """A name such as ``from`` in a group of facts about episodes is that of an episode."""
+    return name if not group or tells(name) else f"episode_{name}"
 
 
 def is_video(item: Any) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
-from acwm_formats.channels import Channels
+from acwm_formats.channels import Channels, named
 from acwm_formats.frames import ImageFrames, file_stamp, regular_times
 from acwm_formats.hdf5_layouts import Layout, array, content, opened
 from acwm_formats.labels import Labels
@@ -103,7 +103,7 @@ class HDF5Recordings:
             images,
             regular_times(len(images), self.rate),
             self.pixel_range,
-            channels=self.channels,
+            channels=named(where, self.channels),
             stamp=f"{name}{rows} {file_stamp(place.path)}",
         )
 

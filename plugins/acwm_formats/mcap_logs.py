@@ -23,7 +23,7 @@ from acwm_formats.frames import ImageFrames, file_stamp
 from acwm_formats.mcap_clocks import Clock, Stamps, clock_note, times_of
 from acwm_formats.mcap_images import Camera, is_image, is_video
 from acwm_formats.mcap_messages import Column, Numbers, entries, topics
-from acwm_formats.names import word, words
+from acwm_formats.names import unread_note, word, words
 from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.timeline import (
     ActionFacts,
@@ -113,7 +113,8 @@ class MCAP(Format):
             options={"video": video, "actions": actions, "states": states, "stamps": stamps}
             | {"follow_links": follow_links},
             actions=ActionFacts(found.names),
-            notes=_notes(first, log, [topic for topic in kinds if topic not in used]),
+            notes=_notes(first, log, [topic for topic in kinds if topic not in used])
+            + tuple(unread_note(root, files)),
             summary=f"Logs of {root.resolve().name}",
         )
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched, parse_json
-from acwm_formats.channels import Channels
+from acwm_formats.channels import Channels, named
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, Images, file_stamp, regular_times, stack_note
 from acwm_formats.hdf5_layouts import array, content
@@ -171,7 +171,8 @@ class MinariRecordings:
     def _frames(self, images: Images, name: str, index: int) -> ImageFrames:
         times = regular_times(len(images), self.rate)
         stamp = f"{index} {name} {file_stamp(_data(self.root) / METADATA)}"
-        return ImageFrames(images, times, self.pixel_range, channels=self.channels, stamp=stamp)
+        channels = named(name, self.channels)
+        return ImageFrames(images, times, self.pixel_range, channels=channels, stamp=stamp)
 
 
 def _texts(seen: Mapping[str, Any]) -> dict[str, Any]:

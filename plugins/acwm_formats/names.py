@@ -48,6 +48,17 @@ def text_note(facts: Iterable[str]) -> list[str]:
     return [kept] if names else []
 
 
+def unread_note(root: Path, used: Iterable[Path]) -> list[str]:
+    """A sentence for people about what else lies in the folder `root`; none if nothing does."""
+    if not root.is_dir():
+        return []
+    others = sorted(
+        path.name for path in {*root.iterdir()} - {*used} if not path.name.startswith((".", "_"))
+    )
+    told = f"{', '.join(others[:5])}{' …' * (len(others) > 5)}"
+    return [f"Files that were not read: {told}."] if others else []
+
+
 def words(text: str | None) -> tuple[str, ...]:
     """Names with a comma between."""
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())

@@ -262,10 +262,11 @@ def _check_head(head: bytes) -> None:
     """Refuse a first line of numbers: it is no header, and would be lost."""
     cells = re.split(r"[,;\t]", head.decode("utf-8-sig", "replace").strip())
     cells = [cell.strip().strip("\"'") for cell in cells]
-    if all(map(_is_number, filter(None, cells))) and any(cells):
+    whole = all(map(_is_number, filter(None, cells))) and any(cells)
+    if whole or any(re.fullmatch(r"-?\d*\.\d+(e-?\d+)?", cell) for cell in cells):
         shown = ", ".join(cells[:4])
         raise ValueError(
-            f"its first line is numbers ({shown}): write the names of the columns above it"
+            f"its first line holds numbers ({shown}): write the names of the columns above it"
         )
 
 

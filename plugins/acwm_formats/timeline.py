@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from acwm_core.env.card import ActionKind, StateField
 from acwm_core.env.episode import Split
 from acwm_core.errors import DataError
+from acwm_formats.channels import Channels
 from acwm_formats.frames import ImageFrames
 from acwm_formats.labels import Labels
 
@@ -123,6 +124,7 @@ class Recording:
         times: ``[T]`` when each frame was taken, in seconds; by default at the dataset's rate.
         action_times: when each action was taken, on the same clock. Then there may be any number of
             actions.
+        channels: what three or four channels of `video` are; found out by default.
     """
 
     video: NDArray[Any]
@@ -130,6 +132,7 @@ class Recording:
     states: Mapping[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
     times: NDArray[np.floating[Any]] | None = None
     action_times: NDArray[np.floating[Any]] | None = None
+    channels: Channels | None = None
 
     def timed(self, name: str, fps: float | None) -> TimedRecording:
         """The same as a `TimedRecording`, with frames at a constant rate if it has no times.
@@ -149,7 +152,7 @@ class Recording:
         taken = None if self.action_times is None else np.asarray(self.action_times, np.float64)
         states = {name: Samples(np.asarray(rows)) for name, rows in self.states.items()}
         stamp = hashlib.sha256(np.ascontiguousarray(video).data).hexdigest()
-        frames = ImageFrames(video, times, stamp=stamp)
+        frames = ImageFrames(video, times, channels=self.channels, stamp=stamp)
         actions = Samples(np.asarray(self.actions), taken)
         return TimedRecording(name, {"video": frames}, actions, states)
 

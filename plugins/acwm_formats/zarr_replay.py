@@ -21,8 +21,8 @@ from zarr.storage import ZipStore
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
-from acwm_formats.channels import Channels
-from acwm_formats.episode_bounds import bounds_of, divides
+from acwm_formats.channels import Channels, named
+from acwm_formats.episode_bounds import bounds_of, tells
 from acwm_formats.format import Format
 from acwm_formats.frames import MOST_FRAMES, ImageFrames, regular_times, stack_note
 from acwm_formats.images import CHANNELS, MOST_BYTES
@@ -37,6 +37,13 @@ PLACES = (
     *("episode_lengths", "meta/ep_len", "data/ep_len", "ep_len"),
 )
 """Arrays that say where episodes end, or how long they are; the first that is there counts."""
+
+NUMBERED = tuple(
+    f"{group}{name}"
+    for group in ("data/", "meta/", "")
+    for name in ("episode_index", "episode_idx", "episode_id", "episode", "ep_idx", "traj_id")
+)
+"""Arrays that number the episode of each row, where no other tells episodes apart."""
 
 ACTIONS = ("action", "actions")
 CODECS = (
@@ -69,7 +76,9 @@ class ZarrReplay(Format):
         if path.name.lower().endswith(".zarr.zip"):
             return path.is_file()
         files = (".zarray", "zarr.json")
-        return any((path / place / file).is_file() for place in PLACES for file in files)
+        return any(
+            (path / place / file).is_file() for place in (*PLACES, *NUMBERED) for file in files
+        )
 
     @guarded
     def read(
@@ -99,7 +108,7 @@ class ZarrReplay(Format):
             follow_links: Whether links may lead out of the folder.
         """
         buffer = Buffer(Path(root))
-        names = [name for name in buffer.names() if not divides(name)]
+        names = [name for name in buffer.names() if not tells(name)]
         found = {name: buffer.array(f"data/{name}") for name in names}
         for name, array in found.items():
             if array.shape[0] != buffer.ends[-1]:
@@ -179,7 +188,7 @@ class ZarrRecordings:
                 StoredImages(self.buffer, name, start, stop),
                 times,
                 self.pixel_range,
-                channels=self.channels,
+                channels=named(name, self.channels),
                 stamp=f"{name} {start} {stop}",
             )
             for name in self.cameras
@@ -278,9 +287,13 @@ class Buffer:
         Raises:
             DataError: nothing says it, or what does contradicts itself.
         """
-        place = next((each for each in PLACES if each in self._group), ENDS)
+        place = next((each for each in (*PLACES, *NUMBERED) if each in self._group), ENDS)
         if (count := self.array(place).shape[0]) > MOST_FRAMES:
             raise DataError(f"{place} of {self.root} claims {count:,} episodes")
+        if place in NUMBERED:
+            numbers, name = self.rows(place, 0, None), place.rpartition("/")[2]
+            whole = bounds_of({name: numbers}, len(numbers), f"{place} of {self.root}")
+            return [stop for _, stop in whole or [(0, len(numbers))]]
         if place != ENDS and not place.endswith("episode_ends"):
             lengths = self.rows(place, 0, None)
             count, name = int(lengths.sum()), place.rpartition("/")[2]

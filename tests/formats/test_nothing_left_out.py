@@ -40,6 +40,27 @@ def test_other_arrays_of_actions_are_named(tmp_path):
     assert any("action.gripper" in note for note in ZarrReplay().read(path, **options).notes)
 
 
+def test_demonstrations_without_a_camera_are_defects(tmp_path):
+    path, _ = arrays.robomimic(tmp_path, PLAIN)
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1/obs/agentview_image"]
+    found = HDF5().read(path).splits
+    assert len(found) == 3
+    with pytest.raises(DataError, match="no array /data/demo_1/obs/agentview_image"):
+        found[1]
+
+
+def test_groups_and_files_that_are_no_recordings_are_named(tmp_path):
+    path, options = arrays.mapped(tmp_path, PLAIN)
+    with h5py.File(path, "a") as file:
+        del file["runs/1/obs/front"]
+    (tmp_path / "more").mkdir()
+    found = HDF5().read(tmp_path, **options)
+    assert len(found.splits) == 2
+    assert any("Groups of mine.h5 without cmd and obs/front: runs/1." in n for n in found.notes)
+    assert "Files that were not read: more." in found.notes
+
+
 def test_columns_of_actions_are_used_together(tmp_path):
     film(tmp_path / "a.mp4", 0)
     lines = [f"{k},{-k},{k % 2}" for k in range(8)]
@@ -101,6 +122,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path, spoil):
         "0;1,5\n1;2,5\n",
         "0\t1\n1\t2\n",
         "1\n2\n",
+        "push,0.5,1\npush,0.6,2\n",
         '"0","1"\n1,2\n',
         "nan,1\n1,2\n",
     ],
@@ -108,7 +130,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path, spoil):
 def test_a_first_row_of_numbers_is_no_header(tmp_path, text):
     film(tmp_path / "a.mp4", 0)
     write(tmp_path / "a.csv", text)
-    with pytest.raises(DataError, match="first line is numbers"):
+    with pytest.raises(DataError, match="first line holds numbers"):
         Videos().read(tmp_path)
 
 

@@ -36,6 +36,9 @@ SAYS = {
     "terminals": {"terminals": LAST},
     "timeouts too": {"terminals": LAST & (NUMBERS % 2 == 0), "timeouts": LAST & (NUMBERS % 2 == 1)},
     "first rows": {"is_first": FIRST},
+    "pairs": {"episode_bounds": np.stack([STARTS, ENDS], 1)},
+    "limits": {"episode_boundaries": np.append(0, ENDS)},
+    "counters": {"step_idx": np.arange(COUNT) - STARTS[NUMBERS]},
 }
 
 
@@ -138,6 +141,23 @@ def test_a_buffer_says_its_ends_in_several_places(tmp_path, place):
     group.create_array(place, data=ENDS)
     assert ZarrReplay.detect(tmp_path / "b.zarr")
     assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
+
+
+@pytest.mark.parametrize("place", ["data/episode_index", "meta/ep_idx"])
+def test_a_buffer_may_number_rows(tmp_path, place):
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    group.create_array("data/img", data=frames())
+    group.create_array("data/action", data=ROWS)
+    group.create_array(place, data=NUMBERS)
+    assert ZarrReplay.detect(tmp_path / "b.zarr")
+    assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
+
+
+def test_an_index_of_episodes_in_a_group(tmp_path):
+    says = {"from": STARTS, "to": ENDS}
+    path = file_of(tmp_path / "all.h5", says, beside="episode_data_index")
+    found = HDF5().read(path, video="pixels", actions="action", rate=10)
+    assert are_the_four(found.splits)
 
 
 def test_a_buffer_may_say_lengths(tmp_path):
