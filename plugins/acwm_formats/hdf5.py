@@ -20,6 +20,7 @@ from acwm_core.env.episode import SPLITS, Episode, Split
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
 from acwm_formats.channels import Channels
+from acwm_formats.episode_bounds import Bounds
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
 from acwm_formats.frames import stack_note
@@ -207,8 +208,8 @@ def _splits(
     for path in files:
         try:
             places, tests = _contents(path, layout)
-        except DataError:
-            damaged.append(Place(path, "/"))  # opening it will tell why
+        except DataError as error:
+            damaged.append(Place(path, "/", problem=str(error)))
             continue
         own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
         for place in places:
@@ -217,6 +218,8 @@ def _splits(
             found.setdefault(split, []).append(place)
     if damaged and found:
         found.setdefault(None if None in found else "train", []).extend(damaged)
+    if damaged and not found:
+        raise DataError(damaged[0].problem)
     if not found:
         what = " and ".join((layout.actions, *layout.cameras.values()))
         raise DataError(f"{files[0]} has no group with {what}")
@@ -241,17 +244,27 @@ def _places(
 ) -> Iterator[Place]:
     """The episodes in a group: one, or several in a row."""
     bounds = None
-    if layout.name != "acwm":
-        count = len(array(file[name], layout.actions))
-        alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
-        bounds = bounds_in(file[name], count, alone=alone)
-        for where in (*layout.cameras.values(), *layout.states.values()) if bounds else ():
-            if (other := len(array(file[name], where))) != count:
-                raise DataError(f"{where} of {path} has {other} rows, and the actions have {count}")
+    try:
+        if layout.name != "acwm":
+            alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
+            bounds = _bounds(file[name], layout, alone=alone)
+    except DataError as error:
+        yield Place(path, name, problem=str(error))
+        return
     if bounds is None:
         yield Place(path, name)
     for number, (start, stop) in enumerate(bounds or ()):
         yield Place(path, name, number, start, stop)
+
+
+def _bounds(group: Any, layout: Layout, *, alone: bool) -> Bounds | None:
+    """The episodes in the rows of a group; None if they are one."""
+    count = len(array(group, layout.actions))
+    bounds = bounds_in(group, count, alone=alone)
+    for where in (*layout.cameras.values(), *layout.states.values()) if bounds else ():
+        if (other := len(array(group, where))) != count:
+            raise DataError(f"{where} has {other} rows, and the actions have {count}")
+    return bounds
 
 
 def _notes(

@@ -33,6 +33,7 @@ class Place(NamedTuple):
         group: the name of its group.
         number: its place among the episodes in the rows of the group; None if it is the only one.
         start, stop: its rows; all by default.
+        problem: why it cannot be opened; empty if it can.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class Place(NamedTuple):
     number: int | None = None
     start: int = 0
     stop: int | None = None
+    problem: str = ""
 
     @property
     def title(self) -> str:
@@ -77,6 +79,8 @@ class HDF5Recordings:
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode."""
         place, path = self.places[index], self.places[index].path
+        if place.problem:
+            raise DataError(place.problem)
         ours = self.layout.name == "acwm"
         with damage_of(path):
             group = shared_file(path)[place.group]

@@ -115,6 +115,15 @@ def test_what_contradicts_itself_is_refused(tmp_path, says):
         HDF5().read(path, video="pixels", actions="action", rate=10).splits[0]
 
 
+def test_one_file_that_contradicts_itself_is_a_defect(tmp_path):
+    file_of(tmp_path / "a.h5", SAYS["lengths"])
+    file_of(tmp_path / "b.h5", WRONG["too few"])
+    recordings = HDF5().read(tmp_path, rate=10).splits
+    assert len(recordings) == 5
+    with pytest.raises(DataError, match="have 38 rows, and it has 39"):
+        recordings[4]
+
+
 def test_demonstrations_that_end_more_than_once_are_one_each(tmp_path):
     """Where every episode has a group, flags do not divide it."""
     with h5py.File(tmp_path / "mine.h5", "w") as file:
