@@ -281,3 +281,24 @@ def test_two_given_frames_tell_how_things_move():
     still = model.read(torch.randn(1, 1, 3, 8, 8)).states["bodies"]
     assert moving.place_change.abs().min() > 0
     assert still.place_change.abs().max() == still.spin.abs().max() == 0
+
+
+def test_groups_combine():
+    """Joints as values and pucks as bodies, in one scene: all that the suite asks of a model."""
+    values = GroupSpec("values", (10, 11, 12), following=1)
+    specs = {"bodies": spec_of(), "values": values}
+
+    def combined(*, latent_channels):
+        sizes = SMALL | {"specs": specs, "state_size": 13}
+        model = SceneDynamics(latent_channels=latent_channels, **sizes)
+        model.prepare(torch.zeros(13), torch.ones(13))
+        return model
+
+    results = {each.name: each for each in check_model(combined)}
+    for name in ("streams what it predicts", "predicts states of every frame"):
+        assert results[name].passed, results[name].reason
+        assert not results[name].reason
+    model, states = combined(latent_channels=2), torch.randn(2, 5, 13)
+    decoded = model.decode(model.encode(states))
+    torch.testing.assert_close(decoded[..., 10:], states[..., 10:])
+    torch.testing.assert_close(decoded[..., :2], states[..., :2])
