@@ -57,9 +57,9 @@ def import_dataset(
     """Write recordings as the data folder `out`.
 
     All recordings are looked at and decoded before anything is refused, so that all defects are in
-    one list; those that are known without decoding are told at once, too. What was decoded is kept,
-    so the same call goes on where a killed one ended, and so does one with other options or after a
-    file was removed.
+    one list; those that are known without decoding are reported at once, too. What was decoded is
+    kept, so the same call goes on where a killed one ended, and so does one with other options or
+    after a file was removed.
 
     Args:
         recorded: what a format read, e.g. ``LeRobot().read(root)``.
@@ -97,7 +97,7 @@ def import_dataset(
 
 @dataclass(frozen=True)
 class _Import:
-    """One import: what was asked for, and the steps.
+    """One import: what is requested, and the steps.
 
     Attributes:
         parts: the recordings of each split, and the places in them of those that belong to it.
@@ -121,59 +121,59 @@ class _Import:
 
     def run(self, shard_episodes: int) -> DatasetCard:
         """Look, decode, and fill the folder."""
-        scans = [] if self.recorded.costly else self._looked_at()
+        scans = [] if self.recorded.costly else self._scan()
         fps = self._rate(scans)
         self._ask_kind(scans)
-        bad = {(each.split, each.index): [*each.defects] for each in scans if each.defects}
-        for each in scans:
-            bad.setdefault((each.split, each.index), []).extend(self._of_another_rate(each, fps))
+        own = {(scan.split, scan.index): [*scan.defects] for scan in scans if scan.defects}
+        rates = {(scan.split, scan.index): self._of_another_rate(scan, fps) for scan in scans}
+        bad = {key: own.get(key, []) + rates[key] for key in {**own, **rates}}
         if self.progress:
-            self._tell([defect for defects in bad.values() for defect in defects])
+            self._report([defect for defects in bad.values() for defect in defects])
         plan = self._plan(scans, fps)
         staging = self.out / STAGING
         if not staging.exists() and (self.out / CARD).exists():
-            return self._made_before(plan)
+            return self._existing(plan)
         with writing(self.out):
             if self.out.exists():
                 _refuse_other_files(self.out)
             staging.mkdir(parents=True, exist_ok=True)
         with held(staging, self.out):
-            staged = self._decoded(fps, {place for place, defects in bad.items() if defects})
-            kept, skipped = self._sound(bad, staged)
-            scans = [each.scan for each in kept]
+            staged = self._decode(fps, {key for key, defects in bad.items() if defects})
+            kept, skipped = self._usable(bad, staged)
+            scans = [recording.scan for recording in kept]
             again = not self.recorded.costly
             rate = action_rate(kept, self.parts, self.reading, staging, again=again)
             card = self.described.card(fps, plan, shard_episodes, scans, skipped, rate)
-            made = self._filled(card, kept)
+            filled = self._fill(card, kept)
         shutil.rmtree(staging, ignore_errors=True)
-        return made
+        return filled
 
     def _ask_kind(self, scans: Sequence[Scan]) -> None:
         """Ask what actions command, if holding them would likely be wrong."""
         facts, kinds = self.recorded.actions, self.options.alignment.kinds
-        if facts.ask and not kinds and any(each.unused for each in scans):
-            most = max(each.per_frame for each in scans)
+        if facts.ask and not kinds and any(scan.unused for scan in scans):
+            most = max(scan.per_frame for scan in scans)
             raise DataError(
                 f"actions come {most:.3g} times per frame, and the files do not say what they "
                 "command: give --action-kind absolute, velocity, torque or delta"
             )
 
-    def _tell(self, defects: Sequence[Defect]) -> None:
-        """Tell defects as soon as they are known, since decoding may take hours."""
+    def _report(self, defects: Sequence[Defect]) -> None:
+        """Print defects as soon as they are known, since decoding may take hours."""
         if defects:
             end = {
                 "refuse": "the others are decoded to find theirs, and kept for the next import",
                 "skip": "these recordings are left out",
                 "trim": "their sound parts are kept",
             }[self.options.alignment.on_defect]
-            lines = "\n".join(f"  {line}" for line in few([str(each) for each in defects]))
+            lines = "\n".join(f"  {line}" for line in few([*map(str, defects)]))
             print(f"found without decoding ({end}):\n{lines}", file=sys.stderr, flush=True)
 
-    def _looked_at(self) -> list[Scan]:
+    def _scan(self) -> list[Scan]:
         total = sum(len(places) for _, places in self.parts.values())
         tasks = [
             ScanTask(
-                _picked(recordings, places[start : start + AT_ONCE]),
+                _subset(recordings, places[start : start + AT_ONCE]),
                 split,
                 tuple(places[start : start + AT_ONCE]),
                 self.reading,
@@ -185,49 +185,48 @@ class _Import:
         executor = self.executor if total > AT_ONCE else LocalExecutor(0)  # workers start slowly
         shown = self.progress and total > AT_ONCE
         with progress_bar("looking", total, shown=shown) as report:
-            found = [each for some in executor.run(scan, tasks, report) for each in some]
-        return sorted(found, key=lambda each: (SPLITS.index(each.split), each.index))
+            scans = [*itertools.chain.from_iterable(executor.run(scan, tasks, report))]
+        return sorted(scans, key=lambda scan: (SPLITS.index(scan.split), scan.index))
 
     def _rate(self, scans: Sequence[Scan]) -> float:
         """Frames per second of the dataset."""
-        if (asked := self.options.alignment.fps) is not None:
-            return plain_rate(asked)
-        measured = [(each.rate, each.seconds) for each in scans]
+        if (fps := self.options.alignment.fps) is not None:
+            return plain_rate(fps)
+        measured = [(scan.rate, scan.seconds) for scan in scans]
         stated = stated_rates(self.recorded, self.first)
         rate = common_rate(measured, stated) or next(iter(stated), None)
         if rate is None:
             raise DataError("the recordings do not tell their rate: give --fps")
         return plain_rate(rate)
 
-    def _of_another_rate(self, each: Scan, fps: float) -> list[Defect]:
-        if self.options.alignment.fps is not None or not each.rate:
+    def _of_another_rate(self, scan: Scan, fps: float) -> list[Defect]:
+        if self.options.alignment.fps is not None or not scan.rate:
             return []
-        off = abs(each.rate / fps - 1)
-        if off <= SAME + QUARTER / max(1.0, each.seconds * each.rate):
+        error = abs(scan.rate / fps - 1)
+        if error <= SAME + QUARTER / max(1.0, scan.seconds * scan.rate):
             return []
-        rates = f"{each.rate:.4g} frames/s, and the others {fps:.4g}"
-        return [Defect(each.name, f"it has {rates}", "--fps")]
+        rates = f"{scan.rate:.4g} frames/s, and the others {fps:.4g}"
+        return [Defect(scan.name, f"it has {rates}", "--fps")]
 
     def _plan(self, scans: Sequence[Scan], fps: float) -> str:
         """What identifies the dataset to be, but for the pixels of its files."""
-        about = [self.recorded.facts, repr(self.options), fps, [each.keys for each in scans]]
+        about = [self.recorded.facts, repr(self.options), fps, [scan.keys for scan in scans]]
         return hashlib.sha256(json.dumps(about, default=repr).encode()).hexdigest()
 
-    def _made_before(self, plan: str) -> DatasetCard:
+    def _existing(self, plan: str) -> DatasetCard:
         """The card of a folder that is whole, if it is what this import would make."""
-        there = DatasetCard.read(self.out)
-        if there.source.get("plan") == plan and set(there.checksums) == set(there.splits):
-            return there
-        now = replace(
-            there, source={**there.source, **self.recorded.facts, **self.described.command()}
-        )
-        raise other_dataset(self.out, there.differences(now) or ["its recordings have changed"])
+        card = DatasetCard.read(self.out)
+        if card.source.get("plan") == plan and set(card.checksums) == set(card.splits):
+            return card
+        source = {**card.source, **self.recorded.facts, **self.described.command()}
+        differences = card.differences(replace(card, source=source))
+        raise other_dataset(self.out, differences or ["its recordings have changed"])
 
-    def _decoded(self, fps: float, bad: set[tuple[str, int]]) -> list[Staged]:
+    def _decode(self, fps: float, bad: set[tuple[str, int]]) -> list[Staged]:
         versions = package_versions()
         tasks = [
             StageTask(
-                _picked(recordings, part),
+                _subset(recordings, part),
                 split,
                 part,
                 self.reading,
@@ -241,25 +240,25 @@ class _Import:
         ]
         total = sum(len(task.indices) for task in tasks)
         with progress_bar(self.recorded.name, total, shown=self.progress) as report:
-            found = [each for some in self.executor.run(stage, tasks, report) for each in some]
-        order = [(task.split, index) for task in tasks for index in task.indices]
-        place = dict(zip(order, range(total), strict=True))
-        return sorted(found, key=lambda each: place[each.scan.split, each.scan.index])
+            staged = [*itertools.chain.from_iterable(self.executor.run(stage, tasks, report))]
+        keys = [(task.split, index) for task in tasks for index in task.indices]
+        order = dict(zip(keys, range(total), strict=True))
+        return sorted(staged, key=lambda one: order[one.scan.split, one.scan.index])
 
     def _together(
         self, split: Split, places: Sequence[int], bad: set[tuple[str, int]]
     ) -> Iterator[tuple[int, ...]]:
         """The recordings to decode, in parts that one task opens."""
-        wanted = [
+        indices = [
             index
             for index in places
             if (split, index) not in bad or self.options.alignment.on_defect == "trim"
         ]
         together = max(self.recorded.together, min(MOST_TOGETHER, len(places) // 256))
-        for _, part in itertools.groupby(wanted, lambda index: index // together):
+        for _, part in itertools.groupby(indices, lambda index: index // together):
             yield tuple(part)
 
-    def _sound(
+    def _usable(
         self, bad: Mapping[tuple[str, int], list[Defect]], staged: Sequence[Staged]
     ) -> tuple[list[Staged], list[str]]:
         """The recordings to keep, and why the others are left out.
@@ -267,28 +266,28 @@ class _Import:
         Raises:
             DataError: some have defects and are not to be left out, or all have.
         """
-        defects = {place: list(each) for place, each in bad.items()}
-        for each in staged:
-            found = defects.setdefault((each.scan.split, each.scan.index), [])
-            found += [defect for defect in each.scan.defects if defect not in found]
-        told = [str(defect) for some in defects.values() for defect in some]
+        defects = {key: list(known) for key, known in bad.items()}
+        by_key = {(recording.scan.split, recording.scan.index): recording for recording in staged}
+        for key, recording in by_key.items():
+            known = defects.setdefault(key, [])
+            known += [defect for defect in recording.scan.defects if defect not in known]
+        messages = [str(defect) for known in defects.values() for defect in known]
         decision = self.options.alignment.on_defect
-        if decision == "trim":
-            kept = [each for each in staged if each.files]
-        else:
-            kept = [each for each in staged if not defects[each.scan.split, each.scan.index]]
-        if told and (decision == "refuse" or not kept):
+        kept = {
+            key: recording
+            for key, recording in by_key.items()
+            if (recording.files if decision == "trim" else not defects[key])
+        }
+        if messages and (decision == "refuse" or not kept):
             count = sum(len(places) for _, places in self.parts.values())
-            wrong = sum(1 for some in defects.values() if some)
+            wrong = sum(1 for known in defects.values() if known)
             choice = "; --on-defect skip imports the others" if kept else ""
-            listed = ";\n".join(f"  {line}" for line in few(told))
+            listed = ";\n".join(f"  {line}" for line in few(messages))
             raise DataError(f"{wrong} of {count} recordings have defects{choice}:\n{listed}")
-        places = {(each.scan.split, each.scan.index) for each in kept}
-        return kept, [
-            str(d) for place, some in defects.items() if place not in places for d in some
-        ]
+        skipped = [str(d) for key, known in defects.items() if key not in kept for d in known]
+        return [*kept.values()], skipped
 
-    def _filled(self, card: DatasetCard, kept: Sequence[Staged]) -> DatasetCard:
+    def _fill(self, card: DatasetCard, kept: Sequence[Staged]) -> DatasetCard:
         """Fill the shards with the staged episodes."""
         staging = self.out / STAGING
         files = {s: [f for k in kept if k.scan.split == s for f in k.files] for s in card.splits}
@@ -303,16 +302,17 @@ class _Import:
         return fill(self.out, card, source, LocalExecutor(0), progress=False)
 
 
-def _first(recorded: RecordedDataset, parts: Parts, asked: Sequence[str] = ()) -> TimedRecording:
+def _first(recorded: RecordedDataset, parts: Parts, chosen: Sequence[str] = ()) -> TimedRecording:
     """The first recording that can be opened."""
     problem = None
     for split, (recordings, places) in parts.items():
         for index in places:
             try:
-                found = opened(recordings, index, episode_name(split, index), recorded.fps)
-                cameras = [name for name in asked if name in found.cameras] or found.cameras
-                if not cameras or any(found.cameras[name].size for name in cameras):
-                    return found
+                recording = opened(recordings, index, episode_name(split, index), recorded.fps)
+                cameras = [name for name in chosen if name in recording.cameras]
+                cameras = cameras or recording.cameras
+                if not cameras or any(recording.cameras[name].size for name in cameras):
+                    return recording
             except (DataError, OSError) as error:
                 problem = problem or DataError(f"{episode_name(split, index)}: {error}")
                 if recorded.costly:
@@ -320,8 +320,8 @@ def _first(recorded: RecordedDataset, parts: Parts, asked: Sequence[str] = ()) -
     raise problem or DataError("there are no recordings")
 
 
-def _picked(recordings: Recordings, places: Sequence[int]) -> Recordings:
-    """What is sent to a worker: of a list only the recordings that it needs."""
+def _subset(recordings: Recordings, places: Sequence[int]) -> Recordings:
+    """What a worker gets: of a list only the recordings that it needs."""
     if isinstance(recordings, list | tuple):
         return cast(Recordings, {index: cast(Any, recordings)[index] for index in places})
     part = getattr(recordings, "part", None)
