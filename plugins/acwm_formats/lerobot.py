@@ -25,7 +25,7 @@ from acwm_formats.lerobot_layout import (
     ACTION,
     COLUMNS,
     INFO,
-    Place,
+    EpisodeFiles,
     arrow,
     read_card,
     read_columns,
@@ -213,12 +213,12 @@ class _Index:
 
     features: dict[str, dict[str, Any]]
     fps: float
-    places: list[Place]
+    places: list[EpisodeFiles]
 
     @functools.cached_property
-    def _by_file(self) -> dict[tuple[str, Path], list[Place]]:
+    def _by_file(self) -> dict[tuple[str, Path], list[EpisodeFiles]]:
         """The episodes of each video, in their order there."""
-        found: dict[tuple[str, Path], list[Place]] = {}
+        found: dict[tuple[str, Path], list[EpisodeFiles]] = {}
         for place in self.places:
             for camera, shown in place.videos.items():
                 found.setdefault((camera, shown.path), []).append(place)
@@ -267,7 +267,7 @@ def _index(root: Path) -> _Index:
 class _RowImages:
     """The images in the rows of an episode."""
 
-    place: Place
+    place: EpisodeFiles
     camera: str
 
     def __len__(self) -> int:
@@ -343,7 +343,7 @@ def _is_numeric(feature: Mapping[str, Any]) -> bool:
     return re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype"))) is not None
 
 
-def _empty(place: Place, names: Sequence[str]) -> list[str]:
+def _empty(place: EpisodeFiles, names: Sequence[str]) -> list[str]:
     """The columns that are null throughout an episode; none if it cannot be read."""
     try:
         table = read_columns(place.data, list(names), place.episode)
@@ -358,7 +358,10 @@ def _unused(features: Mapping[str, Mapping[str, Any]], used: Sequence[str]) -> l
 
 
 def _notes(
-    acting: Sequence[str], unused: Sequence[str], empty: Sequence[str], places: Sequence[Place]
+    acting: Sequence[str],
+    unused: Sequence[str],
+    empty: Sequence[str],
+    places: Sequence[EpisodeFiles],
 ) -> Iterator[str]:
     """What people should know about how the dataset was read."""
     if acting != (ACTION,):
@@ -416,7 +419,7 @@ def _names(feature: Mapping[str, Any]) -> list[str]:
     return list(strings(feature.get("names")))
 
 
-def _tests(info: Mapping[str, Any], places: Sequence[Place]) -> dict[Split, Sequence[int]]:
+def _tests(info: Mapping[str, Any], places: Sequence[EpisodeFiles]) -> dict[Split, Sequence[int]]:
     """The test episodes that the dataset names."""
     tests: dict[Split, list[int]] = {}
     for name, text in cast(dict[str, Any], info.get("splits") or {}).items():
@@ -429,7 +432,7 @@ def _tests(info: Mapping[str, Any], places: Sequence[Place]) -> dict[Split, Sequ
     return {split: numbers for split, numbers in tests.items() if numbers}
 
 
-def _facts(root: Path, places: Sequence[Place]) -> dict[str, Any]:
+def _facts(root: Path, places: Sequence[EpisodeFiles]) -> dict[str, Any]:
     """Facts that identify this dataset without reading all of it."""
     digest = hashlib.sha256((root / INFO).read_bytes())
     starts = [[shown.start for shown in place.videos.values()] for place in places]

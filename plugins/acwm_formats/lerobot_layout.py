@@ -55,7 +55,7 @@ class Shown(NamedTuple):
     end: float | None = None
 
 
-class Place(NamedTuple):
+class EpisodeFiles(NamedTuple):
     """The location of one episode.
 
     Attributes:
@@ -107,7 +107,7 @@ def read_card(root: Path) -> EnvironmentCard | None:
         raise DataError(f"{root / CARD} is not a card ({type(error).__name__}: {error})") from error
 
 
-def read_places(root: Path) -> list[Place]:
+def read_places(root: Path) -> list[EpisodeFiles]:
     """Read the location of every episode, in order of their numbers, which may have gaps.
 
     Raises:
@@ -181,7 +181,7 @@ def _old_rows(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _place(
     root: Path, info: Mapping[str, Any], filmed: Sequence[str], row: Mapping[str, Any]
-) -> Place:
+) -> EpisodeFiles:
     episode, length = int(row["episode_index"]), int(row["length"])
     tasks = tuple(map(str, row.get("tasks") or ()))
     videos: dict[str, Shown] = {}
@@ -190,7 +190,7 @@ def _place(
         for camera in filmed:
             path = _path(root, info["video_path"], {**names, "video_key": camera})
             videos[camera] = Shown(path)
-        return Place(episode, length, _path(root, info["data_path"], names), videos, tasks)
+        return EpisodeFiles(episode, length, _path(root, info["data_path"], names), videos, tasks)
 
     def numbers(prefix: str) -> dict[str, Any]:
         return {key: int(row[f"{prefix}/{key}"]) for key in ("chunk_index", "file_index")}
@@ -201,7 +201,9 @@ def _place(
         end = row.get(f"{key}/to_timestamp")
         start = float(row[f"{key}/from_timestamp"])
         videos[camera] = Shown(path, start, None if end is None else float(end))
-    return Place(episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks)
+    return EpisodeFiles(
+        episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks
+    )
 
 
 def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from acwm_core.errors import DataError
 from acwm_formats.frames import HDR
 from acwm_formats.images import to_rgb
-from acwm_formats.mcap_messages import Entry, content_of, entries, stamp_of
+from acwm_formats.mcap_messages import LoggedMessage, content_of, entries, stamp_of
 
 START = re.compile(rb"\x00\x00\x01(..?)", re.S)
 """The start of a unit in the byte stream of Annex B, and its header."""
@@ -39,7 +39,7 @@ def _last(kind: str) -> str:
     return re.split(r"[./]", kind)[-1]
 
 
-def data_of(entry: Entry) -> bytes:
+def data_of(entry: LoggedMessage) -> bytes:
     """The bytes of a picture or of a frame.
 
     Raises:
@@ -51,7 +51,7 @@ def data_of(entry: Entry) -> bytes:
     return base64.b64decode(data) if isinstance(data, str) else bytes(data)
 
 
-def codec_of(entry: Entry) -> str:
+def codec_of(entry: LoggedMessage) -> str:
     """FFmpeg's name of the codec of a message of video.
 
     Raises:
@@ -155,7 +155,7 @@ class Camera:
         self._codec, self._first = "", 0
         self._before = True  # the first key frame
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LoggedMessage) -> None:
         """Note when a frame was logged; of a video, look for the first key frame."""
         if self._before and is_video(entry.kind):
             self._codec = self._codec or codec_of(entry)

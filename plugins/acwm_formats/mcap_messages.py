@@ -39,7 +39,7 @@ class Numbers(NamedTuple):
     rows: NDArray[np.float64]
 
 
-class Entry(NamedTuple):
+class LoggedMessage(NamedTuple):
     """A message of one of the topics that were asked for.
 
     Attributes:
@@ -80,7 +80,7 @@ def topics(path: Path) -> dict[str, str]:
         }
 
 
-def entries(path: Path, wanted: Sequence[str]) -> Iterator[Entry]:
+def entries(path: Path, wanted: Sequence[str]) -> Iterator[LoggedMessage]:
     """The messages of some topics, in the order in which they were logged.
 
     Raises:
@@ -94,7 +94,9 @@ def entries(path: Path, wanted: Sequence[str]) -> Iterator[Entry]:
                 made = (each.decoder_for(channel.message_encoding, schema) for each in factories)
                 decoders[channel.id] = next((each for each in made if each), None)
             decode = _decoding(path, channel, decoders[channel.id], message.data)
-            yield Entry(channel.topic, schema.name if schema else "", message.log_time, decode)
+            yield LoggedMessage(
+                channel.topic, schema.name if schema else "", message.log_time, decode
+            )
 
 
 def _decoding(path: Path, channel: Any, decoder: Any, data: bytes) -> Callable[[], Any]:
@@ -140,7 +142,7 @@ class Column:
         """Where its messages were logged."""
         return self.name.partition(":")[0]
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LoggedMessage) -> None:
         """Add the numbers of a message; what is wrong with it is told by `numbers`."""
         if self.problem is None:
             try:
@@ -148,7 +150,7 @@ class Column:
             except DataError as error:
                 self.problem = error
 
-    def _add(self, entry: Entry) -> None:
+    def _add(self, entry: LoggedMessage) -> None:
         content, asked = entry.content(), self.name.partition(":")[2]
         found = dict(_leaves(content))
         if asked:

@@ -30,7 +30,7 @@ from acwm_formats.published_layout import (
     METADATA,
     PARTS,
     PLACES,
-    Entry,
+    EpisodeMetadata,
     read_entries,
 )
 from acwm_formats.sources import files_in, guarded
@@ -122,7 +122,9 @@ class Published(Format):
 def _dataset(folder: Path, follow_links: bool) -> RecordedDataset:
     """The dataset of one environment."""
     places = _splits(folder)
-    entries: dict[Split, list[Entry]] = {s: read_entries(places[s] / METADATA) for s in places}
+    entries: dict[Split, list[EpisodeMetadata]] = {
+        s: read_entries(places[s] / METADATA) for s in places
+    }
     name = folder.resolve().name
     meaning = _meaning(_environment_name(name), entries)
     split = next(iter(places))
@@ -186,7 +188,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 @functools.lru_cache(maxsize=1)
-def _entries(path: Path) -> list[Entry]:
+def _entries(path: Path) -> list[EpisodeMetadata]:
     """Read the metadata once per worker for all recordings of a split."""
     return read_entries(path)
 
@@ -215,7 +217,7 @@ class _Meaning(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _meaning(name: str, entries: Mapping[Split, list[Entry]]) -> _Meaning:
+def _meaning(name: str, entries: Mapping[Split, list[EpisodeMetadata]]) -> _Meaning:
     """Take the description from the registered environment if the sizes of its actions match."""
     sizes = Counter(entry.actions.shape[1] for each in entries.values() for entry in each)
     size = sizes.most_common(1)[0][0]  # others are defects of their episodes
@@ -256,7 +258,9 @@ def _card(name: str) -> list[EnvironmentCard]:
     return [card] if isinstance(card, EnvironmentCard) else []
 
 
-def _notes(places: Mapping[Split, Path], entries: Mapping[Split, list[Entry]]) -> list[str]:
+def _notes(
+    places: Mapping[Split, Path], entries: Mapping[Split, list[EpisodeMetadata]]
+) -> list[str]:
     notes: list[str] = []
     for split, place in places.items():
         pieces = len(list(place.glob(PARTS)))

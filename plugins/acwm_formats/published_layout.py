@@ -49,7 +49,7 @@ ENVIRONMENTS = {folder: name for name, (_, folder) in PLACES.items()}
 """The name of an environment in acwm, by its folder."""
 
 
-class Entry(NamedTuple):
+class EpisodeMetadata(NamedTuple):
     """The metadata of one episode.
 
     Attributes:
@@ -63,7 +63,7 @@ class Entry(NamedTuple):
     length: int
 
 
-def read_entries(path: Path) -> list[Entry]:
+def read_entries(path: Path) -> list[EpisodeMetadata]:
     """Read the entries of a ``metadata.pt``, a list of dicts saved by `torch.save`.
 
     Raises:
@@ -76,7 +76,7 @@ def read_entries(path: Path) -> list[Entry]:
     return [_entry(f"episode {i} of {path}", value, i) for i, value in enumerate(values)]
 
 
-def _entry(what: str, value: object, index: int) -> Entry:
+def _entry(what: str, value: object, index: int) -> EpisodeMetadata:
     if not isinstance(value, Mapping):
         raise DataError(f"{what} is not a dict")
     fields = cast(Mapping[Any, Any], value)
@@ -94,7 +94,7 @@ def _entry(what: str, value: object, index: int) -> Entry:
         length = int(cast(Any, length))
     if not isinstance(length, int) or length < 0:
         raise DataError(f"{what} has the length {length!r}")
-    return Entry(name, actions, length)
+    return EpisodeMetadata(name, actions, length)
 
 
 def _numbers(value: object) -> NDArray[np.float32] | None:

@@ -44,7 +44,7 @@ from acwm_formats.timeline import (
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
-class Place(NamedTuple):
+class VideoEpisode(NamedTuple):
     """Where one episode lies.
 
     Attributes:
@@ -177,7 +177,7 @@ class VideoFolder:
         from_first_row: whether the first row was taken with the first frame.
     """
 
-    places: Mapping[int, Place]
+    places: Mapping[int, VideoEpisode]
     count: int
     table: Path | None
     columns: Columns
@@ -198,7 +198,7 @@ class VideoFolder:
         with damage_of(self.table or place.table or Path(place.name)):
             return self._opened(place, index)
 
-    def _opened(self, place: Place, index: int) -> TimedRecording:
+    def _opened(self, place: VideoEpisode, index: int) -> TimedRecording:
         rows, path = self._rows(place, index)
         times = None
         if self.columns.time:
@@ -215,7 +215,7 @@ class VideoFolder:
         facts = {name: _text(rows[name]) for name in self.columns.texts if name in rows}
         return TimedRecording(place.name, cameras, actions, states, rate, facts=facts)
 
-    def _rows(self, place: Place, index: int) -> tuple[Table, Path]:
+    def _rows(self, place: VideoEpisode, index: int) -> tuple[Table, Path]:
         """The rows of an episode, and the file that they are in."""
         path = self.table or place.table
         if self.table is None and place.tables:
@@ -280,13 +280,13 @@ class VideoFolder:
         return functools.partial(Samples, times=times, frames=frames)
 
 
-def find_places(root: Path, actions: str | None = None) -> list[Place]:
+def find_places(root: Path, actions: str | None = None) -> list[VideoEpisode]:
     """The episodes in a folder, in natural order: 2 comes before 10.
 
     Raises:
         DataError: several tables have the name of a video, but for the case of letters.
     """
-    found: list[Place] = []
+    found: list[VideoEpisode] = []
     beside = _Tables(files_in(root, READERS))
     for path in files_in(root, [""]):
         if path.name.startswith("_"):
@@ -317,7 +317,7 @@ class _Tables:
         return sorted(same, key=lambda path: endings.index(path.suffix.lower()))
 
 
-def _folder(folder: Path, actions: str | None, beside: _Tables) -> list[Place]:
+def _folder(folder: Path, actions: str | None, beside: _Tables) -> list[VideoEpisode]:
     """The episode that a folder is: pictures, or a video or folder of pictures per camera."""
     inner = [
         path
@@ -336,14 +336,14 @@ def _folder(folder: Path, actions: str | None, beside: _Tables) -> list[Place]:
     return [_tabled(folder.name, cameras, tables)] if cameras else []
 
 
-def _tabled(name: str, cameras: Mapping[str, Path], tables: Sequence[Path]) -> Place:
+def _tabled(name: str, cameras: Mapping[str, Path], tables: Sequence[Path]) -> VideoEpisode:
     """An episode with its table, or with several of which none is chosen."""
     if len(tables) == 1:
-        return Place(name, cameras, tables[0])
-    return Place(name, cameras, None, tuple(path.name for path in tables))
+        return VideoEpisode(name, cameras, tables[0])
+    return VideoEpisode(name, cameras, None, tuple(path.name for path in tables))
 
 
-def _grouped(folder: Path, table: Path | None) -> list[Place]:
+def _grouped(folder: Path, table: Path | None) -> list[VideoEpisode]:
     """The episodes of a folder whose pictures are numbered anew in each, as ``ep_0_step_0.png``.
 
     Raises:
@@ -362,7 +362,7 @@ def _grouped(folder: Path, table: Path | None) -> list[Place]:
     ends = np.cumsum([len(numbers) for numbers in groups.values()]).tolist()
     starts = [0, *ends[:-1]]
     return [
-        Place(_title(begins), {"video": folder}, table, (), begins, (start, stop, ends[-1]))
+        VideoEpisode(_title(begins), {"video": folder}, table, (), begins, (start, stop, ends[-1]))
         for begins, start, stop in zip(groups, starts, ends, strict=True)
     ]
 
@@ -381,7 +381,7 @@ def _pictures(folder: Path) -> list[Path]:
     return files_in(folder, PICTURES)
 
 
-def _shared(root: Path, places: Sequence[Place], actions: str | None) -> Path | None:
+def _shared(root: Path, places: Sequence[VideoEpisode], actions: str | None) -> Path | None:
     """The table for all episodes, if there is one."""
     tables = files_in(root, READERS)
     named = [path for path in tables if actions and folded(path.name) == folded(actions)]
@@ -403,7 +403,9 @@ def _read_once(path: Path, _: str) -> Table:
     return read_table(path)
 
 
-def _rows_of(table: Table, column: str, index: int, place: Place, count: int, path: Path) -> Table:
+def _rows_of(
+    table: Table, column: str, index: int, place: VideoEpisode, count: int, path: Path
+) -> Table:
     """The rows of one episode, named by its video or by its place in natural order."""
     values = table[column]
     if values.dtype.kind in "iuf":
@@ -456,7 +458,7 @@ def _text(column: NDArray[Any]) -> str | list[str]:
     return known[0] if len(known) == 1 else known
 
 
-def _facts(places: Sequence[Place], table: Path | None) -> dict[str, Any]:
+def _facts(places: Sequence[VideoEpisode], table: Path | None) -> dict[str, Any]:
     """What identifies the folder without reading all of it."""
     sources = [path for place in places for path in place.cameras.values()]
     sources += [path for path in (table, *(place.table for place in places)) if path]
@@ -464,7 +466,9 @@ def _facts(places: Sequence[Place], table: Path | None) -> dict[str, Any]:
     return {"episodes": len(places), "bytes": sum(path.stat().st_size for path in files)}
 
 
-def _notes(root: Path, places: Sequence[Place], path: Path, chosen: Columns) -> tuple[str, ...]:
+def _notes(
+    root: Path, places: Sequence[VideoEpisode], path: Path, chosen: Columns
+) -> tuple[str, ...]:
     left = [name for name in read_table(path) if name not in {*chosen.actions, *chosen.states}]
     left = [name for name in left if name not in (chosen.time, chosen.frame, chosen.episode)]
     notes = [f"Actions are the columns {', '.join(chosen.actions)}."]
@@ -490,7 +494,7 @@ def _notes(root: Path, places: Sequence[Place], path: Path, chosen: Columns) -> 
     return tuple(notes)
 
 
-def _unread(root: Path, places: Sequence[Place], tables: set[Path | None]) -> list[str]:
+def _unread(root: Path, places: Sequence[VideoEpisode], tables: set[Path | None]) -> list[str]:
     """Names of files and folders beside the recordings that are none."""
     used = {path for place in places for path in place.cameras.values()} | tables
     used |= {path.parent for path in used if path and path.parent != root}
