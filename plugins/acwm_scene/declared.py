@@ -185,7 +185,8 @@ def _bodies(
     angles = {each.owners: each for each in fields if each.kind == "angle" and each.owners}
     positions = [each for each in fields if each.kind == "position"]
     bodies = [each for each in positions if each.owners in angles]
-    agents = [each for each in positions if each.owners not in angles and each.entries == 2]
+    names = {name for each in bodies for name in each.owners}
+    agents = [each for each in positions if each.entries == 2 and not names & {*each.owners}]
     if len(bodies) != 1 or not agents or card.camera is None:
         return None
     body = bodies[0]
