@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import inspect
 import os
 import signal
 import sys
@@ -272,7 +273,7 @@ def _refuse_unguarded_script() -> None:
     file, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
     if file is None or (spec is not None and spec.name.rpartition(".")[2] == "__main__"):
         return  # of a console, or of a package: those are not imported
-    frame = sys._getframe()
+    frame = inspect.currentframe()
     while frame and not (frame.f_globals is vars(main) and frame.f_code.co_filename == file):
         frame = frame.f_back
     while frame and frame.f_code.co_name != "<module>":

@@ -295,7 +295,7 @@ def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
 
 def _report_range(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
     """Warn of actions beyond those that the model was trained on."""
-    spec, of_split = card.action, dataset.card.actions.get(dataset.split, {})
+    spec, of_split = card.action, dataset.card.actions.get(cast(Split, dataset.split), {})
     for name, low, high, least, most in zip(
         spec.names,
         spec.low,

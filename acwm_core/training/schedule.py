@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, cast
+from typing import cast
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
@@ -32,7 +32,7 @@ class ResumedSchedule(Callback):
         if self._before in (None, trainer.max_steps):
             return
         schedule = cast(LambdaLR, trainer.lr_scheduler_configs[0].scheduler)
-        groups = cast(list[dict[str, Any]], schedule.optimizer.param_groups)
+        groups = schedule.optimizer.param_groups
         before = float(groups[0]["lr"])
         for group, peak, factor in zip(groups, schedule.base_lrs, schedule.lr_lambdas, strict=True):
             group["lr"] = peak * factor(schedule.last_epoch)
