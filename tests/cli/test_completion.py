@@ -60,10 +60,10 @@ def test_keys_come_with_their_values():
             "",
             [
                 "diffusion_forcing",
-                "energy_score",
                 "full_sequence",
                 "next_frame",
                 "regression",
+                "scene",
                 "shortcut",
             ],
         ),

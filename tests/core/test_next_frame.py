@@ -8,7 +8,7 @@ from acwm_core.errors import RecipeError
 from acwm_core.model.batch import Batch
 from acwm_core.model.build import build_model
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import Cache, Denoiser
+from acwm_core.model.dynamics import Cache, Denoiser, ModelInputs
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
 from acwm_core.model.objectives.next_frame import NextFrame, frames_before
 from acwm_core.recipe import ComponentConfig
@@ -168,9 +168,10 @@ def test_a_clip_draws_the_same_beside_any_others():
 
 def test_a_recipe_sets_what_the_objective_needs():
     choice = ComponentConfig("dit_xs", {"causal": None, "inputs": None})
-    model = build_model(choice, next_frame(), 4)
+    inputs = ModelInputs(latent_channels=4, temporal_stride=4)
+    model = build_model(choice, next_frame(), inputs)
     assert (model.causal, model.inputs) == (True, NextFrame.inputs)
-    model = build_model(choice, DiffusionForcing(), 4)
+    model = build_model(choice, DiffusionForcing(), inputs)
     assert (model.causal, model.inputs) == (True, {})
 
 

@@ -13,6 +13,7 @@ import acwm
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, RecipeError, ShapeError
+from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.objectives.regression import Regression
 from acwm_dream.environment import Dream
 from tests import tiny
@@ -179,7 +180,7 @@ class Windy(tiny.Exact):
 
 def test_an_episode_draws_one_future_from_its_seed(run, monkeypatch):
     monkeypatch.setattr("tests.tiny.Exact", Windy)
-    monkeypatch.setattr(Regression, "draws", True)  # as if it taught to draw
+    monkeypatch.setattr(Regression, "check_model", Objective.check_model)  # as if it taught to draw
     env, options, still = dream(run), {"spec": tiny.spec(3)}, np.zeros(2, np.float32)
 
     def last(seed):

@@ -33,12 +33,19 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
         ["+next_frame", "+recurrent"],
         ["+recurrent", "+small", "+next_frame"],  # whose objectives follow the model
     ):
-        assert objective(*words) == ("regression", {"state_weight": 0.3, "frames": None})
-    assert objective("+recurrent", "model=dit_xs") == ("diffusion_forcing", SMALL)
+        assert objective(*words) == ("regression", {"frames": None})
+    scene = {"state_weight": 0.3, "frames": None, "motion_steps": 0}
+    assert objective("model=scene") == ("scene", scene)
+    assert objective("+next_frame", "+scene") == (
+        "scene",
+        {**scene, "frames": 4, "motion_steps": 8000},
+    )
+    for words in (["+recurrent", "model=dit_xs"], ["model=scene", "model=dit_xs"]):
+        assert objective(*words) == ("diffusion_forcing", SMALL)
 
 
 def test_parameters_given_with_the_model_are_those_of_its_own_objective(tmp_path):
-    wanted = ("regression", {"state_weight": 0.3, "frames": 4})
+    wanted = ("regression", {"frames": 4})
     for words in (
         ["model=recurrent", "objective.frames=4"],
         ["objective.frames=4", "+recurrent"],
@@ -62,7 +69,7 @@ def test_an_objective_chosen_with_the_model_or_later_stays(tmp_path):
     mine.write_text("extends: push_cube_small\nmodel: recurrent\nobjective: next_frame\n")
     assert objective(recipe=mine)[0] == "next_frame"
     mine.write_text("extends: push_cube_small\nmodel: recurrent\n")
-    assert objective(recipe=mine) == ("regression", {"state_weight": 0.3, "frames": None})
+    assert objective(recipe=mine) == ("regression", {"frames": None})
 
 
 def test_a_saved_recipe_says_what_was_used(tmp_path):
