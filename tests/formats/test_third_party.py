@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
-from acwm_core.errors import DataError, PluginError
+from acwm_core.errors import DataError
 from acwm_core.plugins import catalog, hookimpl
 from acwm_formats.checks import check_format
 from acwm_formats.format import Format
@@ -207,16 +207,6 @@ def test_a_path_in_two_formats_needs_a_name(third_party, root, tmp_path):
     done = said("data", "import", root, "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert "is in several formats: give --format, one of also, npz" in done.stderr
-
-
-def test_hooks_of_the_release_before_are_told(fresh_catalog):
-    @hookimpl
-    def register_dataset_importers(registry):
-        pass
-
-    plugin = types.SimpleNamespace(register_dataset_importers=register_dataset_importers)
-    with pytest.raises(PluginError, match=r"one `acwm_formats\.format\.Format` with `detect`"):
-        catalog().add_plugin(plugin, "old")
 
 
 @pytest.mark.parametrize("component", installed("format"), ids=lambda c: c.name)
