@@ -35,7 +35,7 @@ from acwm_core.training.data import ClipData
 from acwm_core.training.growing import GrowingClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
 from acwm_core.training.module import TrainingModule
-from acwm_core.training.precision import with_recorded_precision
+from acwm_core.training.precision import RecordedPrecision, with_recorded_precision
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.resume import (
     AUTO,
@@ -131,7 +131,13 @@ def _train(
     trainer = build_trainer(
         recipe.trainer,
         config,
-        [preemption, callbacks.CpuTime(start), schedule, *_callbacks(run, config, data)],
+        [
+            preemption,
+            callbacks.CpuTime(start),
+            RecordedPrecision(),
+            schedule,
+            *_callbacks(run, config, data),
+        ],
         loggers,
     )
     on_one_cpu = trainer.strategy.root_device.type == "cpu" and trainer.world_size == 1
@@ -233,6 +239,7 @@ def _start_from(
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:
     chosen: list[Callback] = [
         callbacks.NanGuard(run),
+        RecordedPrecision(),
         callbacks.SavedWeights(run),
         StepProgress(),
         callbacks.LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),

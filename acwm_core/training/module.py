@@ -32,7 +32,6 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
-from acwm_core.training.precision import PRECISION
 from acwm_core.training.preparation import PreparationClips
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
@@ -226,9 +225,8 @@ class TrainingModule(L.LightningModule):
         update_average(self.averaged, self.world_model, decay)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Leave out the frozen codec, which the run's recipe names; record the precision."""
+        """Leave out the frozen codec, which the run's recipe names."""
         checkpoint["state_dict"] = without_codec(checkpoint["state_dict"])
-        checkpoint[PRECISION] = self.trainer.precision
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set batch counters as if all steps had used the current number of batches per step."""

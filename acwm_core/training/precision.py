@@ -5,8 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
 
 from acwm_core.errors import AcwmWarning
 from acwm_core.model.precision import bfloat16_is_fast, bfloat16_slowdown, gpu_has_bfloat16
@@ -17,6 +20,16 @@ PRECISION = "precision"
 """Name of the flag of Lightning's Trainer, and of the entry in a checkpoint."""
 
 _CANONICAL = {"16": "16-mixed", "bf16": "bf16-mixed", "32": "32-true", "64": "64-true"}
+
+
+class RecordedPrecision(Callback):
+    """Writes the precision of a run into its checkpoints, so that it is kept when it is resumed."""
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Add it to the checkpoint."""
+        checkpoint[PRECISION] = trainer.precision
 
 
 def canonical(precision: object) -> str:
