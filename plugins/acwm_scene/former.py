@@ -66,6 +66,7 @@ class PlanarBodies(Former):
         blocks: int = 4,
         noise: int = 0,
     ) -> None:
+        state_size = state_size or 2 * agents + 4 * bodies
         above = Camera.flat(view)
         spec = GroupSpec(
             "bodies",
@@ -138,6 +139,7 @@ class FlexibleBody(Former):
         width: int = 192,
         blocks: int = 4,
     ) -> None:
+        state_size = state_size or 2 * (agents + math.prod(nodes))
         spec = GroupSpec(
             "nodes",
             tuple(range(state_size)),

@@ -88,7 +88,7 @@ class SceneObjective(Regression):
         return pictures + self.state_weight * others
 
     def example_model(self, latent_channels: int) -> SceneDynamics:
-        """A small scene of two values."""
+        """A small scene of four values."""
         return SceneDynamics(
-            latent_channels=latent_channels, state_size=2, channels=8, width=4, blocks=1
+            latent_channels=latent_channels, state_size=4, channels=16, width=4, blocks=1
         )
