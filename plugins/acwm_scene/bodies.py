@@ -171,7 +171,8 @@ class BodyGroup(Group):
         chosen = torch.randperm(len(agents), generator=random)[:FOLLOWED].to(agents.device)
         agents, actions = agents[chosen], actions[chosen]
         noise = to_device(torch.randn(agents[:, 0].shape, generator=random), agents)
-        place, passed = agents[:, 0] + START_NOISE * noise, list[Tensor]()
+        passed: list[Tensor] = []
+        place = agents[:, 0] + START_NOISE * noise
         change = torch.zeros_like(place)
         hidden = place.new_zeros(*place.shape[:2], HIDDEN)
         for action in actions[:, self.stride :].unbind(1):
@@ -206,7 +207,7 @@ class BodyGroup(Group):
 
     def _pushed(self, state: Moving, path: Tensor) -> Poses:
         """The poses in all frames of the path `[B, H, A, 2]` of the agents."""
-        passed = list[Poses]()
+        passed: list[Poses] = []
         for agents in path.unbind(1):
             state = self.body_motion(state, agents)
             passed.append(state.poses)

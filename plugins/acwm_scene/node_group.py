@@ -202,7 +202,8 @@ class NodeGroup(Group):
         chosen = torch.randperm(len(agents), generator=random)[:FOLLOWED].to(agents.device)
         agents, actions = agents[chosen], actions[chosen]
         noise = to_device(torch.randn(agents[:, 0].shape, generator=random), agents)
-        places, passed = agents[:, 0] + START_NOISE * noise, list[Tensor]()
+        passed: list[Tensor] = []
+        places = agents[:, 0] + START_NOISE * noise
         hidden = self.agent_motion.begin(AGENT * places.flatten(1))
         for action in actions[:, self.stride :].unbind(1):
             places, hidden = self._followed_by(places, action, hidden)
@@ -229,7 +230,7 @@ class NodeGroup(Group):
     def _pushed(self, window: Form, begun: Tensor, chance: tuple[Tensor, ...]) -> Tensor:
         """The nodes in the frames of a window after the first two, `[B, H, N, D]`."""
         form, change = Form(window.agents[:, 1], begun), window.nodes[:, 1] - window.nodes[:, 0]
-        passed = list[Tensor]()
+        passed: list[Tensor] = []
         for number in range(2, window.nodes.shape[1]):
             agents = window.agents[:, number]
             moved, change = self.node_motion(form, agents, change, chance)

@@ -111,6 +111,7 @@ class View(nn.Module):
     def __init__(self, camera: Camera, unit: float) -> None:
         super().__init__()
         self.is_flat = camera.half_height is not None
+        self.above = -1.0 if camera.eye[2] < 0 else 1.0  # a camera may look up at the plane
         scale = unit / camera.half_height if camera.half_height else 2 * camera.focal()
         rows = torch.tensor(camera.axes) * torch.tensor([[scale], [scale], [1.0]]).double()
         self.register_buffer("axes", rows.float(), persistent=False)
@@ -145,9 +146,8 @@ class View(nn.Module):
             self.places(torch.cat([spots, torch.full_like(spots[..., :1], depth)], -1), aspect)
             for depth in (0.0, 1.0)
         )
-        above = -1.0 if self.eye[2] < 0 else 1.0  # a camera may look up at the plane
-        fall = (above * (near - far)[..., 2:]).clamp(min=HORIZON)
-        return (near + above * near[..., 2:] / fall * (far - near))[..., :2]
+        fall = (self.above * (near - far)[..., 2:]).clamp(min=HORIZON)
+        return (near + self.above * near[..., 2:] / fall * (far - near))[..., :2]
 
 
 def seen_at(grid: Tensor, spots: Tensor) -> Tensor:
@@ -159,7 +159,8 @@ def seen_at(grid: Tensor, spots: Tensor) -> Tensor:
 
 def along_sides(nodes: Tensor, shape: tuple[int, ...]) -> Tensor:
     """What separates each node from its neighbours, `[B, N, 2 · sides · D]`; 0 beyond an edge."""
-    grid, found = nodes.unflatten(1, shape), list[Tensor]()
+    found: list[Tensor] = []
+    grid = nodes.unflatten(1, shape)
     for side in range(1, len(shape) + 1):
         steps, none = grid.diff(dim=side), torch.zeros_like(grid.narrow(side, 0, 1))
         found += [torch.cat([steps, none], side), torch.cat([none, -steps], side)]

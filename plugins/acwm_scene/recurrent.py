@@ -98,7 +98,8 @@ class RecurrentModel(Predictor):
     ) -> Latent:
         """Unroll all frames, and read only some; see `Predictor.predict_frames`."""
         actions = self.actions(conditioning)
-        state, grids = self.start(given, actions[:, 0]), list[Tensor]()
+        grids: list[Tensor] = []
+        state = self.start(given, actions[:, 0])
         for frame in range(given.shape[1], frames):
             state = self.step(state, actions[:, frame])
             grids.append(state.grid)

@@ -392,7 +392,7 @@ class SceneDynamics(Predictor):
         self, scene: Scene, actions: Mapping[str, Tensor]
     ) -> tuple[Scene, list[dict[str, Any]]]:
         """The scene after a latent frame, and how things are in each of its video frames."""
-        frames = list[dict[str, Any]]()
+        frames: list[dict[str, Any]] = []
         for number in range(self.stride):
             scene = self.move(scene, {name: rows[:, number] for name, rows in actions.items()})
             frames.append(self._frames_of(scene))

@@ -198,7 +198,8 @@ class ValueGroup(Group):
 
     def _followed(self, start: Tensor, actions: Tensor, *chance: Tensor) -> Tensor:
         """The values after each of the actions `[B, H, …]`, `[B, H, V]`."""
-        values, hidden, passed = start, self.motion.begin(start), list[Tensor]()
+        passed: list[Tensor] = []
+        values, hidden = start, self.motion.begin(start)
         for action in actions.unbind(1):
             values, hidden = self.motion(action, values, hidden, chance)
             passed.append(values)

@@ -33,7 +33,10 @@ def installed(kind) -> list[Component]:
     return [
         component
         for component in components
-        if component.distribution and not component.missing_modules()
+        if component.distribution
+        and not component.missing_modules()
+        # Those that only read runs of earlier versions are the same under another name.
+        and ".former:" not in component.target
     ]
 
 

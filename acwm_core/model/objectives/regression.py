@@ -108,13 +108,15 @@ def _predicted(
 ) -> Latent:
     """The predicted frames: all, or those of `numbers`."""
     batch, known, *size = given.latents.shape
+    # One that does not draw gets none, as a compiled model takes no generators.
+    generators = given.generators if model.samples else ()
     if numbers is None:
         method, count = "forward", frames - known
-        predicted = model(given.latents, given.conditioning, frames, given.generators)
+        predicted = model(given.latents, given.conditioning, frames, generators)
     else:
         method, count = "predict_frames", numbers.shape[1]
         predicted = model.predict_frames(
-            given.latents, given.conditioning, frames, numbers, given.generators
+            given.latents, given.conditioning, frames, numbers, generators
         )
     check_shape(model, method, predicted, batch, count, *size)
     return predicted
