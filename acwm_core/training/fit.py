@@ -35,7 +35,11 @@ from acwm_core.training.data import ClipData
 from acwm_core.training.growing import GrowingClipData
 from acwm_core.training.loggers import build_loggers, silence_irrelevant_warnings
 from acwm_core.training.module import TrainingModule
-from acwm_core.training.precision import RecordedPrecision, with_recorded_precision
+from acwm_core.training.precision import (
+    PRECISION,
+    RecordedPrecision,
+    with_recorded_precision,
+)
 from acwm_core.training.progress import StepProgress
 from acwm_core.training.resume import (
     AUTO,
@@ -89,8 +93,6 @@ def fit(recipe: Recipe, run_dir: Path | str, *, resume: Path | str | None = None
         with first_decides():
             claim.enter_context(claimed(run))
             checkpoint = checkpoint_to_resume(run, recipe, episodes.card, resume)
-        if checkpoint:
-            recipe = with_recorded_precision(recipe, Recipe.from_yaml(run.recipe), checkpoint)
         first_step = read_step(checkpoint) if checkpoint else 0
         if not 0 < recipe.trainer.get("max_steps", -1) <= first_step:
             loggers = build_loggers(run, recipe.trainer, first_step)
@@ -128,8 +130,13 @@ def _train(
     module, preemption = TrainingModule(world_model, config), Preemption(run)
     before = Recipe.from_yaml(run.recipe) if checkpoint else None
     schedule = ResumedSchedule(before.trainer.get("max_steps", -1) if before else None)
+    flags = recipe.trainer
+    if before and checkpoint:
+        flags = with_recorded_precision(recipe, before, checkpoint).trainer
+        if PRECISION in before.trainer:  # an earlier version recorded it nowhere else
+            recipe = replace(recipe, trainer=flags)
     trainer = build_trainer(
-        recipe.trainer,
+        flags,
         config,
         [
             preemption,

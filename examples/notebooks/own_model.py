@@ -48,7 +48,7 @@ class NextFrame(Predictor):
         hidden = functional.silu(self.read(latent) + modulation[:, :, None, None])
         return latent + self.out(functional.silu(self.mix(hidden)))
 
-    def forward(self, given, conditioning, frames):
+    def forward(self, given, conditioning, frames, generators=()):
         """Predict the latent frames of a clip after the given ones, `[B, L − K, C, h, w]`."""
         clip = [given[:, -1]]
         for frame in range(given.shape[1], frames):

@@ -35,7 +35,7 @@ def _turns(
 )
 @click.option("--steps", type=click.IntRange(1), default=1200, help="Optimiser steps.")
 @click.option("--episodes", type=click.IntRange(1), default=200, help="Episodes to train on.")
-@click.option("--seed", type=int, default=0)
+@click.option("--seed", type=int, default=0, help="Seed of the weights and of the frames.")
 def train_estimator(
     data: Path, out: Path, angles: dict[str, int], steps: int, episodes: int, seed: int
 ) -> None:

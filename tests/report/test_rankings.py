@@ -46,7 +46,7 @@ def test_a_ranking_stands_on_the_page_and_in_files(mine, tmp_path):
     text = write_report([mine]).read_text()
     assert "<h2>Ranking policies</h2>" in text
     assert "&lt;place&gt; · 2 policies, 6 episodes of each" in text
-    assert "loses 0.2 px per action, at random 0.4, over 6 starts" in text
+    assert "Regret: 0.2 px per action by the model’s choice, 0.4 at random, over 6 starts" in text
     assert "<place>" not in text
     names = {path.name for path in export_report([mine], tmp_path / "out")}
     (csv,) = [n for n in names if n.startswith("policies-") and n.endswith(".csv")]

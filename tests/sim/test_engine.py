@@ -98,6 +98,7 @@ import torch
 from kernel import triple
 from acwm_core.plugins import catalog
 environment = catalog().component("environment", "push_cube").create(size=(64, 64))
+environment.reset(seed=0)
 print(triple(2.0))
 """
     cache = tmp_path / "cache"
