@@ -40,7 +40,7 @@ def recipe_keys() -> list[str]:
     """``section.key``, with the name of the component for those of core's own components."""
     from acwm_core.plugins import OWN
     from acwm_core.recipe.check import SECTIONS
-    from acwm_core.recipe.compose import COMPONENTS
+    from acwm_core.recipe.sections import COMPONENTS
     from acwm_core.recipe.signature import signature
 
     found = [f"{section}=NAME" for section in COMPONENTS]

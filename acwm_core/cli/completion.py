@@ -13,14 +13,15 @@ from acwm_core.errors import AcwmError
 from acwm_core.plugins import catalog
 from acwm_core.recipe.check import SECTIONS, check_names
 from acwm_core.recipe.compose import (
-    COMPONENTS,
     OVERLAYS,
-    read_recipe,
+    merge,
+    read_layers,
     recipe_folder,
     recipe_names,
 )
-from acwm_core.recipe.objective import INHERITED, resolved
+from acwm_core.recipe.objective import with_objective
 from acwm_core.recipe.recipe import flat_items
+from acwm_core.recipe.sections import COMPONENTS
 from acwm_core.recipe.signature import signature
 from acwm_core.recipe.types import show
 
@@ -97,7 +98,7 @@ def _recipe(ctx: click.Context) -> dict[str, Any]:
     if not name:
         return {}
     try:
-        recipe = resolved(read_recipe(name))
+        recipe = with_objective(merge(*read_layers(name), quick=True))
         recipe |= check_names(recipe)
     except AcwmError:
         return {}
@@ -105,7 +106,6 @@ def _recipe(ctx: click.Context) -> dict[str, Any]:
         if chosen := recipe.get(section):
             kind = "environment" if section == "env" else section
             recipe[section] = {**catalog().component(kind, chosen["name"]).defaults, **chosen}
-    recipe["objective"].pop(INHERITED, None)
     return recipe
 
 

@@ -10,9 +10,9 @@ from typing import Any, cast
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import Component, catalog
 from acwm_core.recipe import types
-from acwm_core.recipe.compose import COMPONENTS
 from acwm_core.recipe.metrics import LIBRARY_CLASS, MetricConfig, class_of_library, metric_configs
-from acwm_core.recipe.objective import INHERITED, resolved
+from acwm_core.recipe.objective import with_objective
+from acwm_core.recipe.sections import COMPONENTS
 from acwm_core.recipe.signature import REQUIRED, Signature, signature
 
 SECTIONS = {
@@ -41,7 +41,7 @@ def validate(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         The parameters of each section, converted to the types of their constructors. Components
         also have a `name`; an optional component that was not given is missing.
     """
-    recipe = resolved(recipe)
+    recipe = with_objective(recipe)
     values = check_names(recipe)
     listed, evaluation = _metrics(values["evaluation"]), values["evaluation"]
     for name, config in listed.items():
@@ -66,7 +66,7 @@ def check_names(recipe: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     Raises:
         RecipeError: an unknown section, component or flag, a wrong type, or something missing.
     """
-    recipe = resolved(recipe)
+    recipe = with_objective(recipe)
     plain = (*SECTIONS, "trainer")
     for name in recipe:
         if name not in (*COMPONENTS, *plain):
@@ -101,14 +101,11 @@ def check_component(section: str, choice: Any) -> dict[str, Any]:
     component's requirements are not installed, its parameters are not checked.
     """
     component, params = _component(section, choice)
-    inherited = params.pop(INHERITED, {})
     params = _without_retired(section, component, params)
     values = {**component.defaults, **params}
     takes = signature(resolve_name("acwm_core.env.environment:Environment"))
     if section != "env" or values.keys() - takes.parameters:
         takes = _signature_of(component)
-    shared = {name: value for name, value in inherited.items() if name in takes.parameters}
-    values = {**component.defaults, **shared, **params}
     fitted = (*FITTED.get(section, ()), *_fitted_by(component))
     return {"name": component.name, **_check(section, takes, values, fitted)}
 

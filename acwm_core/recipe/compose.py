@@ -10,7 +10,8 @@ from typing import Any, cast
 from acwm_core.errors import AcwmWarning, DataError, RecipeError, suggest
 from acwm_core.plugins import catalog
 from acwm_core.recipe.former import current_sections
-from acwm_core.recipe.objective import INHERITED, chosen, inherited
+from acwm_core.recipe.objective import Layer, objective_section, with_objective
+from acwm_core.recipe.sections import COMPONENTS, deep_merge, mapping_or_empty, written_out
 from acwm_core.recipe.text import parse
 
 OVERLAYS = "overlays"
@@ -22,9 +23,6 @@ VARIANTS = "paper"
 FORMER_PARAMETERS = {"training.agent_steps": "objective.motion_steps"}
 """Parameters that overrides may name by what they were called before."""
 
-COMPONENTS = ("env", "codec", "model", "conditioner", "objective")
-"""Sections that hold a component, i.e. a registered name and its parameters."""
-
 
 def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Read a recipe file with all recipes it extends, and apply overrides to it.
@@ -35,25 +33,18 @@ def read_recipe(name: str | Path, overrides: Sequence[str] = ()) -> dict[str, An
             YAML. Order matters only between two overrides of one parameter (the last one
             counts) and between overlays, which are applied in order.
     """
+    return merge(*read_layers(name, overrides))
+
+
+def read_layers(name: str | Path, overrides: Sequence[str] = ()) -> list[Layer]:
+    """What `read_recipe` merges: a layer per file, and one for the overrides."""
     path = find_recipe(str(name), Path())
-    return with_overrides(_laid_over({}, path), overrides, path.parent)
+    return _with_overrides(_with_file([], path), overrides, path.parent)
 
 
-def with_overrides(
-    recipe: Mapping[str, Any], overrides: Sequence[str], folder: Path | None = None
-) -> dict[str, Any]:
-    """Apply overlays, and then the other overrides, to a composed recipe.
-
-    Args:
-        folder: the folder of the recipe. Its own overlays take precedence over packaged ones.
-    """
-    changes: dict[str, Any] = {}
-    for override in overrides:
-        if override.startswith("+"):
-            recipe = _laid_over(recipe, _find_overlay(override, folder or Path()))
-        else:
-            changes = _merged(changes, parse_override(override))
-    return merge(recipe, changes)
+def with_overrides(recipe: Layer, overrides: Sequence[str]) -> dict[str, Any]:
+    """Apply overlays, and then the other overrides, to a composed recipe."""
+    return merge(*_with_overrides([recipe], overrides, Path()))
 
 
 def parse_override(override: str) -> dict[str, Any]:
@@ -77,20 +68,24 @@ def parse_override(override: str) -> dict[str, Any]:
         names = path.split(".")
     for name in reversed(names[1:]):
         value = {name: value}
-    return {names[0]: _normal(names[0], value)}
+    return {names[0]: written_out(names[0], value)}
 
 
-def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep-merge recipes; if a component's name changes, its old parameters are dropped.
+def merge(*layers: Layer, quick: bool = False) -> dict[str, Any]:
+    """Deep-merge layers, the last one on top; a component that changes drops its old parameters.
 
-    A new objective inherits those that it takes too.
+    Args:
+        quick: leave out the parameters that a new objective keeps (`objective_section`).
     """
-    kept = dict(base)
-    for section in COMPONENTS:
-        old, new = base.get(section), changes.get(section)
-        if old and new and "name" in new and new["name"] != old.get("name"):
-            kept[section] = inherited(old) if section == "objective" else {}
-    return chosen(changes, _merged(kept, changes))
+    recipe: dict[str, Any] = {}
+    for layer in layers:
+        for section in COMPONENTS:
+            old, new = recipe.get(section), layer.get(section)
+            if old and new and "name" in new and new["name"] != old.get("name"):
+                recipe[section] = {}
+        recipe = deep_merge(recipe, layer)
+    objective = objective_section(layers, quick=quick)
+    return {**recipe, "objective": objective} if objective else recipe
 
 
 def recipe_folder() -> Path:
@@ -118,26 +113,35 @@ def recipe_summaries() -> dict[str, str]:
     return {name: text.splitlines()[0].lstrip("# ") for name, text in texts.items()}
 
 
-def _laid_over(base: Mapping[str, Any], path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+def _with_overrides(layers: list[Layer], overrides: Sequence[str], folder: Path) -> list[Layer]:
+    """The layers with overlays, of which those in `folder` come first, and with overrides."""
+    changes: dict[str, Any] = {}
+    for override in overrides:
+        if override.startswith("+"):
+            layers = _with_file(layers, _find_overlay(override, folder))
+        else:
+            changes = deep_merge(changes, parse_override(override))
+    return [*layers, changes]
+
+
+def _with_file(layers: list[Layer], path: Path, above: tuple[Path, ...] = ()) -> list[Layer]:
     if path in above:
         circle = " → ".join(p.name for p in (*above[above.index(path) :], path))
         raise RecipeError(f"recipes extend each other in a circle: {circle}")
-    own = _content(path)
+    own = {section: written_out(section, value) for section, value in _content(path).items()}
     extends: Any = own.pop("extends", [])
     names = cast(list[Any], extends if isinstance(extends, list) else [extends])
     if not all(isinstance(name, str) for name in names):
         raise RecipeError(f"`extends` in {path} must be a list of recipe files")
-    recipe = dict(base)
     for name in names:
-        recipe = _laid_over(recipe, find_recipe(name, path.parent), (*above, path))
-    own = current_sections(own)
-    recipe = _replaced(recipe, own.pop("replace", {}), path)
-    changes = {section: _normal(section, value) for section, value in own.items()}
+        layers = _with_file(layers, find_recipe(name, path.parent), (*above, path))
+    layers = _with_replacements(layers, own.pop("replace", {}), path)
+    changes = current_sections(own, merge(*layers, quick=True).get("model"))
     codec: dict[str, Any] = changes.get("codec") or {}
     for name, value in codec.items():  # a trained model's folder contains its codec's files
         if isinstance(value, str) and (path.parent / value).is_file():
             codec[name] = str(path.parent / value)
-    return merge(recipe, changes)
+    return [*layers, changes]
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -151,7 +155,7 @@ def _content(path: Path) -> dict[str, Any]:
     return {str(section): value for section, value in cast(dict[Any, Any], content).items()}
 
 
-def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str, Any]:
+def _with_replacements(layers: list[Layer], replacements: Any, path: Path) -> list[Layer]:
     """Replace values of the recipe that the section `replace` of an overlay lists.
 
     ``{"model": {"dit_s": "dit_xs"}, "data.path": {"data/a": "data/b"}}`` replaces the model if it
@@ -163,14 +167,13 @@ def _replaced(recipe: dict[str, Any], replacements: Any, path: Path) -> dict[str
         raise RecipeError(f"`replace` in {path} must list replacements, as in model: {{old: new}}")
     for name, table in cast(Mapping[str, Mapping[Any, Any]], replacements).items():
         section, _, parameter = str(name).partition(".")
-        values: Any = recipe.get(section)
-        given = cast(dict[str, Any], values) if isinstance(values, dict) else {}
-        old = {**given.get(INHERITED, {}), **given}.get(parameter or "name")
+        recipe = with_objective(merge(*layers, quick=section != "objective" or not parameter))
+        old = mapping_or_empty(recipe.get(section)).get(parameter or "name")
         new = table.get(old) if isinstance(old, str) else None
         if new is not None:
-            change = {parameter: new} if parameter else _normal(section, new)
-            recipe = merge(recipe, {section: change})
-    return recipe
+            change = {parameter: new} if parameter else written_out(section, new)
+            layers = [*layers, {section: change}]
+    return layers
 
 
 def _find_overlay(override: str, folder: Path) -> Path:
@@ -202,21 +205,3 @@ def find_recipe(name: str, folder: Path) -> Path:
         main = [each for each in recipe_names() if each in catalog().registry("environment")]
         near = f"; the main ones are {', '.join(main)} (see `acwm list recipe`)"
     raise RecipeError(f"there is no recipe {name!r}{near}")
-
-
-def _normal(section: str, value: Any) -> Any:
-    """Expand the short form ``model: dit_s``."""
-    if section in COMPONENTS and value is not None and not isinstance(value, Mapping):
-        return {"name": value}
-    return value  # pyright: ignore[reportUnknownVariableType]
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        old = merged.get(key)
-        if isinstance(old, dict) and isinstance(value, dict):
-            merged[key] = _merged(cast(dict[str, Any], old), cast(dict[str, Any], value))
-        else:
-            merged[key] = value
-    return merged

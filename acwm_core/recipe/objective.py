@@ -1,75 +1,73 @@
-"""Which objective a composed recipe has: the one chosen for its model, or the model's own."""
+"""Which objective a recipe has: the one named last, by a file or by the choice of a model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, cast
 
-from acwm_core.plugins import catalog
+from acwm_core.plugins import Component, catalog
+from acwm_core.recipe.sections import deep_merge, mapping_or_empty
+from acwm_core.recipe.signature import signature
+
+Layer = Mapping[str, Any]
+"""What one recipe file, or all overrides together, change."""
 
 USUAL = "full_sequence"
 """The objective of a recipe that names none."""
 
-FOLLOWS = "follows_model"
-"""Key of the section `objective`: a model with an objective of its own learns by that instead. It
-is set where such a model is chosen later than the objective, and where a recipe says so."""
 
-OWN = "own"
-"""Key in that section for the names of parameters that were given to the model's own objective."""
+def objective_section(layers: Iterable[Layer], *, quick: bool = False) -> dict[str, Any]:
+    """The section `objective` of a recipe that consists of some layers, the last one on top.
 
-INHERITED = "inherited"
-"""Key in a recipe's section `objective` for the parameters of objectives that it replaced."""
+    A layer that names a model with an objective of its own names that objective, too, unless it
+    names one itself. The model's objective holds until a layer names an objective or a model;
+    without it, the one named before holds again. Parameters belong to the objective that holds
+    where they are given; one that is named keeps those of former ones that it takes, too.
 
-
-def chosen(changes: Mapping[str, Any], merged: dict[str, Any]) -> dict[str, Any]:
-    """Note in a recipe, into which changes were merged, whether its objective follows its model."""
-    objective: Mapping[str, Any] = changes.get("objective") or {}
-    if "name" in objective and FOLLOWS not in objective:
-        merged["objective"].pop(FOLLOWS, None)
-    elif objective_of(changes.get("model") or {}):
-        merged["objective"] = {**(merged.get("objective") or {}), FOLLOWS: True}
-    section: Mapping[str, Any] = merged.get("objective") or {}
-    if "name" not in objective and section.get(FOLLOWS) and objective_of(merged.get("model") or {}):
-        own = sorted({*section.get(OWN, ()), *objective} - {FOLLOWS})
-        merged["objective"] = {**section, OWN: own}
-    return merged
+    Args:
+        quick: leave out the parameters that are kept, for which the objective is imported.
+    """
+    former: dict[str, Any] = {}
+    named: dict[str, Any] = {}
+    of_model: dict[str, Any] = {}
+    for layer in layers:
+        given, model = (mapping_or_empty(layer.get(name)) for name in ("objective", "model"))
+        current, own = of_model or named, objective_of(model)
+        if "name" in given:
+            former = {**former, **named, **of_model}
+            named, of_model = current if current.get("name") == given["name"] else {}, {}
+        elif "name" in model and own != current.get("name"):
+            of_model = {"name": own} if own else {}
+        if of_model:
+            of_model = deep_merge(of_model, given)
+        else:
+            named = deep_merge(named, given)
+    taken = _parameters(named.get("name")) if former and not (of_model or quick) else ()
+    return of_model or {name: former[name] for name in taken if name in former} | named
 
 
 def objective_of(model: Mapping[str, Any]) -> str | None:
     """The objective that the model of this section was registered with, if any."""
-    models, name = catalog().registry("model"), model.get("name")
-    return models[name].objective if isinstance(name, str) and name in models else None
+    component = _registered("model", model.get("name"))
+    return component.objective if component else None
 
 
-def inherited(old: Mapping[str, Any]) -> dict[str, Any]:
-    """What a new objective inherits from the section of the one that it replaces.
-
-    The noise path has the same meaning for all objectives of flow matching, so parameters are kept
-    until it is known which of them the new one takes.
-    """
-    before = old.get(INHERITED, {})
-    notes = ("name", FOLLOWS, INHERITED, OWN)
-    own = {name: value for name, value in old.items() if name not in notes}
-    return {INHERITED: {**before, **own}}
-
-
-def resolved(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    """A composed recipe with its final objective.
-
-    If the model was chosen without an objective, e.g. by ``model=recurrent``, it is the one that
-    the model was registered with, if any, with the parameters that were given with that model or
-    later; else the one that the recipe names.
-    """
+def with_objective(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    """A recipe whose objective is named: by itself, by its model, or the usual one."""
     objective: Any = recipe.get("objective") or {}
-    if not isinstance(objective, Mapping):
+    if not isinstance(objective, Mapping) or "name" in objective:
         return {**recipe}  # the check of the section says what is wrong
-    values = {"name": USUAL, **cast(Mapping[str, Any], objective)}
-    own, given = objective_of(recipe.get("model") or {}), values.pop(OWN, ())
-    follows = values.pop(FOLLOWS, False)
-    if "name" not in objective and own:
-        values["name"] = own
-    elif follows and own:
-        values = {"name": own, **{name: values[name] for name in given}}
-    else:  # another model was chosen later
-        values = {name: value for name, value in values.items() if name not in given}
-    return {**recipe, "objective": values}
+    name = objective_of(mapping_or_empty(recipe.get("model"))) or USUAL
+    return {**recipe, "objective": {"name": name, **cast(Mapping[str, Any], objective)}}
+
+
+def _parameters(objective: Any) -> Collection[str]:
+    component = _registered("objective", objective)
+    if component is None or component.missing_modules():
+        return ()
+    return signature(component.load()).parameters
+
+
+def _registered(kind: str, name: Any) -> Component | None:
+    registry = catalog().registry(kind)
+    return registry[name] if isinstance(name, str) and name in registry else None

@@ -8,8 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
 
-from acwm_core.recipe.check import validate
-from acwm_core.recipe.compose import COMPONENTS, read_recipe
+from acwm_core.recipe.check import check_names, validate
+from acwm_core.recipe.compose import merge, read_layers
+from acwm_core.recipe.sections import COMPONENTS
 from acwm_core.recipe.text import dump
 from acwm_core.recipe.trust import recipes_are_trusted, refuse_code
 
@@ -129,7 +130,9 @@ def compose(
         RecipeError: a file, name, parameter or type is wrong; suggests the most similar one. Or
             the recipe names code that the overrides do not.
     """
-    composed = read_recipe(recipe, overrides)
+    layers = read_layers(recipe, overrides)
+    check_names(merge(*layers, quick=True))
+    composed = merge(*layers)
     if not (recipes_are_trusted() if trusted is None else trusted):
         refuse_code(composed, overrides, sections, recipe)
     return Recipe.from_dict(composed)

@@ -21,7 +21,7 @@ from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite, float32_by_default
 from acwm_core.model.world_model import WorldModel
 from acwm_core.recipe import Recipe, compose
-from acwm_core.recipe.compose import COMPONENTS
+from acwm_core.recipe.sections import COMPONENTS
 from acwm_core.training.run_folder import RunFolder, find_run, trained_models
 
 FORMAT = 1

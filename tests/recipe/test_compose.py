@@ -134,6 +134,12 @@ def test_circles_are_refused(folder: Path) -> None:
         read_recipe(folder / "a.yaml")
 
 
+def test_a_replaced_parameter_may_be_one_that_a_new_objective_kept(overlaid: Path) -> None:
+    (overlaid / "mine.yaml").write_text("extends: own.yaml\nobjective: next_frame\n")
+    assert read_recipe(overlaid / "mine.yaml")["objective"]["prediction"] == "clean"
+    assert read_recipe(overlaid / "mine.yaml", ["+tiny"])["objective"]["prediction"] == "velocity"
+
+
 def test_missing_files_name_the_nearest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "a.yaml").write_text("extends: [rot.yaml]\n")
     with pytest.raises(RecipeError, match=r"'rot\.yaml'; did you mean 'root\.yaml'"):

@@ -1,4 +1,4 @@
-"""The objective of a recipe: swapped by a word, following its model, read from older recipes."""
+"""The objective of a recipe: named by a word, by its model, or in an older recipe."""
 
 import pytest
 import yaml
@@ -22,6 +22,8 @@ def test_a_new_objective_keeps_the_noise_path_and_drops_the_rest():
         {**SMALL, "past_noise": 0.3, "own_past": 0.5},
     )
     assert objective("+next_frame", "objective=full_sequence") == ("full_sequence", SMALL)
+    assert objective("+shortcut", "+next_frame")[1].items() >= SMALL.items()
+    assert objective("+recurrent", "objective=diffusion_forcing")[1] == SMALL
     with pytest.raises(RecipeError, match="FullSequence has no parameter 'own_past'"):
         objective("objective=full_sequence", "objective.own_past=0.5")
 
@@ -31,7 +33,7 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
         ["model=recurrent"],
         ["+recurrent"],
         ["+next_frame", "+recurrent"],
-        ["+recurrent", "+small", "+next_frame"],  # whose objectives follow the model
+        ["+recurrent", "+small"],  # which replaces the objective of the paper alone
     ):
         assert objective(*words) == ("regression", {"frames": None})
     scene = {"state_weight": 0.3, "frames": None, "motion_steps": 0}
@@ -40,8 +42,9 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
         "scene",
         {**scene, "frames": 4, "motion_steps": 8000},
     )
-    for words in (["+recurrent", "model=dit_xs"], ["model=scene", "model=dit_xs"]):
+    for words in (["+recurrent", "model=dit_xs"], ["+scene", "model=dit_xs"]):
         assert objective(*words) == ("diffusion_forcing", SMALL)
+    assert objective("+scene", "model=recurrent") == ("regression", {"frames": None})
 
 
 def test_parameters_given_with_the_model_are_those_of_its_own_objective(tmp_path):
@@ -70,6 +73,8 @@ def test_an_objective_chosen_with_the_model_or_later_stays(tmp_path):
     assert objective(recipe=mine)[0] == "next_frame"
     mine.write_text("extends: push_cube_small\nmodel: recurrent\n")
     assert objective(recipe=mine) == ("regression", {"frames": None})
+    assert objective("+next_frame", recipe=mine)[0] == "next_frame"  # refused with this model
+    assert objective("objective=regression", "objective.frames=2", recipe=mine)[1]["frames"] == 2
 
 
 def test_a_saved_recipe_says_what_was_used(tmp_path):
@@ -78,7 +83,6 @@ def test_a_saved_recipe_says_what_was_used(tmp_path):
         recipe = compose("push_cube_small", words)
         saved.write_text(recipe.to_yaml())
         assert compose(saved) == recipe
-        assert "follows" not in saved.read_text()
 
 
 def test_a_recipe_that_names_none_is_one_level_per_clip():
@@ -89,6 +93,17 @@ def test_a_recipe_that_names_none_is_one_level_per_clip():
     sections["model"] = {"name": "recurrent"}
     recipe = Recipe.from_dict({**sections, "data": {"path": "data"}})
     assert recipe.objective.name == "regression"
+
+
+def test_an_older_file_whose_objective_follows_the_model_is_read(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    follows = "objective: {name: next_frame, follows_model: true, own_past: 0.5}\n"
+    for first in ("extends: push_cube_small\nmodel: recurrent\n", "extends: small\n"):
+        mine.write_text(first + follows)
+        assert objective(recipe=mine) == ("regression", {"frames": None})
+    mine.write_text("extends: push_cube_small\n" + follows)
+    assert objective(recipe=mine)[1] == {**SMALL, "past_noise": 0.3, "own_past": 0.5}
+    assert objective("+recurrent", recipe=mine)[0] == "regression"
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,6 @@ def test_the_overlay_lays_it_over_the_small_setting():
     recipe = compose("push_cube_small", ["+shortcut"])
     assert recipe.objective.name == "shortcut"
     assert recipe.objective.params["shift"] == 20.0
-    assert compose("push_cube_small", ["+recurrent", "+shortcut"]).objective.name == "regression"
 
 
 @pytest.mark.parametrize("bad", [{"finest": 12}, {"bootstrapped": 1.5}, {"steps": 0}])
