@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import io
+import lzma
 import math
 import os
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,8 +20,14 @@ from numpy.typing import NDArray
 LARGE, RATIO = 2**28, 200
 """Bytes that a small file may always unpack to, and how many times its size beyond them."""
 
+_LONGEST_HEADER = 2**14
+"""Bytes at the start of an array within which its header ends; NumPy's are of 10,000 at most."""
+
 _DAMAGED = (ArithmeticError, RecursionError, MemoryError, SyntaxError, TypeError)
 """What parsing a header raises besides `ValueError`."""
+
+_UNSOUND = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, LookupError)
+"""What `zipfile` raises for an archive that is damaged or encrypted."""
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -41,23 +49,29 @@ def check_unpacked(stored: int, unpacked: int) -> None:
         raise ValueError(f"{stored:,} bytes claim to hold {unpacked:,}")
 
 
-def read_npy(file: IO[bytes], size: int) -> NDArray[Any]:
+def read_npy(file: IO[bytes], size: int, check: Callable[..., None] | None = None) -> NDArray[Any]:
     """The array in a ``.npy`` file that has `size` bytes from where `file` is.
+
+    Args:
+        check: called with its shape and dtype before it is unpacked; raises if it is not wanted.
 
     Raises:
         ValueError: it is damaged, claims more than there is, or holds objects or structures.
     """
     try:
         start = file.tell()
-        version = np.lib.format.read_magic(file)
+        head = io.BytesIO(file.read(_LONGEST_HEADER))
+        version = np.lib.format.read_magic(head)
         if version not in _HEADERS:
             raise ValueError("its arrays are no plain numbers")
-        shape, _, dtype = _HEADERS[version](file)
+        shape, _, dtype = _HEADERS[version](head)
         if dtype.hasobject or dtype.names or not dtype.itemsize:
             raise ValueError(f"it holds {dtype}, not plain numbers or text")
-        needed, there = math.prod(shape) * dtype.itemsize, size - (file.tell() - start)
+        needed, there = math.prod(shape) * dtype.itemsize, size - head.tell()
         if min(shape, default=0) < 0 or needed > there:
             raise ValueError(f"it claims to hold {list(shape)} {dtype}, and has {there:,} bytes")
+        if check is not None:
+            check(shape, dtype)
         file.seek(start)
         return np.lib.format.read_array(file, allow_pickle=False)
     except (*_DAMAGED, tokenize.TokenError) as error:
@@ -75,15 +89,20 @@ def load_npy(path: Path) -> NDArray[Any]:
         return read_npy(file, os.fstat(file.fileno()).st_size)
 
 
-def load_npz(path: Path) -> dict[str, NDArray[Any]]:
+def load_npz(path: Path, check: Callable[..., None] | None = None) -> dict[str, NDArray[Any]]:
     """The arrays in an ``.npz`` file by name.
 
+    Args:
+        check: called with name, shape and dtype of each before it is unpacked; raises if it is not
+            wanted.
+
     Raises:
-        ValueError: it is damaged, unpacks to far more than it stores, or a member is no array.
+        ValueError: it is damaged, unpacks to far more than it stores, or a member is no array, or
+            holds more.
         OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        return _read_npz(file, os.fstat(file.fileno()).st_size)
+        return _read_npz(file, os.fstat(file.fileno()).st_size, check)
 
 
 def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
@@ -91,7 +110,9 @@ def from_npz(data: bytes) -> dict[str, NDArray[Any]]:
     return _read_npz(io.BytesIO(data), len(data))
 
 
-def _read_npz(file: IO[bytes], size: int) -> dict[str, NDArray[Any]]:
+def _read_npz(
+    file: IO[bytes], size: int, check: Callable[..., None] | None = None
+) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {}
     try:
         with zipfile.ZipFile(file) as archive:
@@ -103,8 +124,11 @@ def _read_npz(file: IO[bytes], size: int) -> dict[str, NDArray[Any]]:
                     why = "is there twice" if name in arrays else "is no array"
                     raise ValueError(f"its member {member.filename} {why}")
                 with archive.open(member) as opened:
-                    arrays[name] = read_npy(opened, member.file_size)
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, LookupError) as error:
+                    named = functools.partial(check, name) if check else None
+                    arrays[name] = read_npy(opened, member.file_size, named)
+                    if opened.read(1):
+                        raise ValueError(f"its member {name} has more than its header says")
+    except _UNSOUND as error:
         raise ValueError(f"it is no sound NPZ ({error})") from error
     return arrays
 

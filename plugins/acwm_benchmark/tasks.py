@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_benchmark.arrays import read_array
+from acwm_core.arrays import load_npz
 from acwm_core.data.shards import file_sha256
 from acwm_core.env.episode import SPLITS
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import parse_json, plain_name, read_json, regular_file, typed
 
 BENCHMARK, INDEX, SUMS, README = "benchmark.json", "index.jsonl", "SHA256SUMS", "README.md"
+
+OVERHEAD = 2**20
+"""Bytes by which an NPZ file may be larger than its array."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +172,38 @@ class Tasks:
 
         path = regular_file(self.folder, task.actions)
         return read_array(path, "actions", check, math.prod(wanted) * 4)
+
+
+def read_array(
+    path: Path, name: str, check: Callable[[tuple[int, ...], np.dtype[Any]], None], most_bytes: int
+) -> NDArray[Any]:
+    """Read the array `name`, the only one of an NPZ file.
+
+    Args:
+        check: called with shape and dtype before anything is unpacked; raises a `DataError` if they
+            are not those wanted.
+        most_bytes: size of the largest array that is wanted; a file that is much larger is refused.
+
+    Raises:
+        DataError: it is damaged, or holds something else or more.
+    """
+    if (size := path.stat().st_size) > most_bytes + OVERHEAD:
+        raise DataError(
+            f"{path.name} has {size:,} bytes, more than the {most_bytes:,} that are asked for"
+        )
+
+    def is_wanted(found: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if found != name:
+            raise DataError(f"{path.name} holds {found:.40}: give {name!r} alone")
+        check(shape, dtype)
+
+    try:
+        arrays = load_npz(path, is_wanted)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path.name} cannot be read ({error!s:.200})") from error
+    if not arrays:
+        raise DataError(f"{path.name} holds nothing, not {name!r}")
+    return arrays[name]
 
 
 def write_index(folder: Path, worlds: Mapping[str, World], tasks: Iterable[Task]) -> None:

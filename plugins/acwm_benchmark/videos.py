@@ -14,8 +14,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from acwm_benchmark.arrays import read_array
-from acwm_benchmark.tasks import World
+from acwm_benchmark.tasks import World, read_array
 from acwm_core.errors import DataError
 from acwm_formats.frames import VideoFrames, container_of
 from acwm_formats.names import natural

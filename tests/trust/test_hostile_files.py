@@ -63,6 +63,7 @@ def test_an_archive_of_arrays_is_no_bomb(tmp_path, monkeypatch):
         ([(f"{i}.npy", npy((large // 4,), "|u1", bytes(large // 4))) for i in range(5)], "claim"),
         ([("a.txt", b"hello")], "a.txt is no array"),
         ([("a.npy", b"hello")], "magic"),
+        ([("a.npy", to_npy(np.zeros(3)) + b"more")], "more than its header says"),
     ):
         path = tmp_path / "arrays.npz"
         path.write_bytes(packed(members))
