@@ -1,12 +1,13 @@
-"""dm_control's reacher as an environment of acwm: a world that was not made for it.
+"""Gymnasium's Reacher as an environment of acwm: a world that was not made for it.
 
-Physics, model and camera are those of `dm_control.suite`; frames are drawn here, as its own need
-OpenGL. The card declares what the states are and where the camera is, and nothing else is told to
-anybody.
+Physics and model are those of `gymnasium.envs.mujoco`; frames are drawn here, as its own need
+OpenGL.
+The card alone declares what the states are and where the camera is.
 """
 
+import gymnasium
+import mujoco
 import numpy as np
-from dm_control import suite
 
 from acwm_core.env.camera import Camera
 from acwm_core.env.environment import ActionSpec, Environment, EnvironmentCard, StateField
@@ -16,12 +17,12 @@ from acwm_core.env.symmetry import Symmetry
 HEIGHT = 0.01  # of all that moves, metres
 
 CARD = EnvironmentCard(
-    name="dm_reacher",
-    summary="dm_control's arm of two links, whose finger reaches for a target.",
-    action=ActionSpec(("shoulder", "wrist"), ("", ""), (-1.0, -1.0), (1.0, 1.0), "torque"),
+    name="gymnasium_reacher",
+    summary="Gymnasium's arm of two links, whose finger reaches for a target.",
+    action=ActionSpec(("shoulder", "wrist"), ("", ""), (-0.05,) * 2, (0.05,) * 2, "torque"),
     frame_size=(64, 64),
     fps=10,
-    horizon=40,
+    horizon=20,
     factors=(
         Factor.continuous(
             "target_radius",
@@ -52,7 +53,7 @@ CARD = EnvironmentCard(
         ),
     ),
     instances=("floor", "target", "arm", "hand", "finger"),
-    engine="dm_control (MuJoCo)",
+    engine="Gymnasium (MuJoCo)",
     symmetries=(Symmetry((-1, -2), mirrored=True, states={"joint_velocity": (-1, -2)}),),
     camera=Camera(eye=(0, 0, 0.75), up=(0, 1, 0), fov=45),
 )
@@ -60,57 +61,52 @@ CARD = EnvironmentCard(
 COLOURS = np.array([[60, 80, 110], [220, 80, 80], [200, 170, 90], [160, 190, 100], [240, 240, 240]])
 
 
-class DmReacher(Environment):
+class GymnasiumReacher(Environment):
     """Starts at rest at random joint angles, with the target at a random place."""
 
     card = CARD
 
     def __init__(self, **params):
         super().__init__(**params)
-        self.suite = suite.load("reacher", "easy")
-        self.physics = self.suite.physics
+        self.reacher = gymnasium.make("Reacher-v5").unwrapped
+        self.model, self.data = self.reacher.model, self.reacher.data
 
     def _start(self, factors, rng):
         self.radius = float(factors["target_radius"])
         angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(0.06, 0.2)
-        self.target = far * np.array([np.cos(angle), np.sin(angle)])
-        self._begin(rng.uniform([-np.pi, -2.5], [np.pi, 2.5]))
+        target = far * np.array([np.cos(angle), np.sin(angle)])
+        self._begin(rng.uniform([-np.pi, -2.5], [np.pi, 2.5]), target)
 
-    def _begin(self, angles):
-        self.physics.reset()
-        self.physics.named.model.geom_size["target", 0] = self.radius
-        self.physics.named.model.geom_pos["target", :2] = self.target
-        self.physics.data.qpos[:] = angles
-        self.physics.forward()
+    def _begin(self, angles, target):
+        mujoco.mj_resetData(self.model, self.data)
+        self.model.geom("target").size[0] = self.radius
+        self.reacher.set_state(np.concatenate([angles, target]), np.zeros(4))
 
     def _perturb(self, amount, rng):
-        self._begin(self.physics.data.qpos + amount * rng.normal(0, 1e-3, 2))
+        angles, target = np.split(self.data.qpos.copy(), 2)
+        self._begin(angles + amount * rng.normal(0, 1e-3, 2), target)
 
     def _transform(self, symmetry):
-        shoulder, wrist = self.physics.data.qpos
-        self.target = self.target * [-1, 1]
-        self._begin([np.pi - shoulder, -wrist])
+        shoulder, wrist, x, y = self.data.qpos
+        self._begin([np.pi - shoulder, -wrist], [-x, y])
 
     def _advance(self, action):
-        self.physics.set_control(action)
-        self.physics.step(round(1 / self.card.fps / self.physics.timestep()))
+        self.reacher.do_simulation(action, round(1 / self.card.fps / self.model.opt.timestep))
 
-    def _places(self, *names):
-        return [self.physics.named.data.geom_xpos[name, :2].copy() for name in names]
+    def _place(self, body):
+        return self.data.body(body).xpos[:2].copy()
 
     def _render(self):
         height, width = self.frame_size
-        model = self.physics.model
-        half = (model.cam_pos[0, 2] - HEIGHT) * np.tan(np.radians(model.cam_fovy[0]) / 2)
+        half = (CARD.camera.eye[2] - HEIGHT) * np.tan(np.radians(CARD.camera.fov) / 2)
         pixel = 2 * half / height
         y, x = np.indices(self.frame_size) + 0.5
         points = np.stack([x - width / 2, height / 2 - y], -1) * pixel
-        arm, hand, finger = self._places("arm", "hand", "finger")
-        elbow, tip = 2 * arm, 2 * hand - 2 * arm
+        target, elbow, finger = map(self._place, ("target", "body1", "fingertip"))
         parts = (
-            np.linalg.norm(points - self.target, axis=-1) - self.radius,
+            np.linalg.norm(points - target, axis=-1) - self.radius,
             _from_rod(points, np.zeros(2), elbow),
-            _from_rod(points, elbow, tip),
+            _from_rod(points, elbow, finger),
             np.linalg.norm(points - finger, axis=-1) - 0.015,
         )
         frame, mask = (
@@ -124,13 +120,11 @@ class DmReacher(Environment):
         return frame.round().astype(np.uint8), mask
 
     def _state(self):
-        (finger,) = self._places("finger")
-        wrapped = (self.physics.data.qpos + np.pi) % (2 * np.pi) - np.pi
         return {
-            "joint_angle": wrapped,
-            "joint_velocity": self.physics.data.qvel.copy(),
-            "finger_position": finger,
-            "target_position": self.target.copy(),
+            "joint_angle": (self.data.qpos[:2] + np.pi) % (2 * np.pi) - np.pi,
+            "joint_velocity": self.data.qvel[:2].copy(),
+            "finger_position": self._place("fingertip"),
+            "target_position": self._place("target"),
         }
 
     def _contacts(self):
@@ -139,7 +133,7 @@ class DmReacher(Environment):
     def policy(self, rng):
         def torques():
             while True:
-                torque = rng.uniform(-1, 1, 2)
+                torque = rng.uniform(CARD.action.low, CARD.action.high)
                 for _ in range(rng.integers(3, 9)):
                     yield torque
 
