@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -19,23 +20,23 @@ from acwm_core.env.card import EnvironmentCard
 from acwm_core.env.episode import SPLITS, Episode, Split
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
+from acwm_formats.array_store import ArrayLayout, StoredEpisode, StoredEpisodes
 from acwm_formats.channels import Channels
 from acwm_formats.episode_bounds import Bounds
 from acwm_formats.example import exported_example
 from acwm_formats.format import Export, Format
 from acwm_formats.frames import stack_note
 from acwm_formats.hdf5_layouts import (
-    Layout,
     array,
     bounds_in,
-    content,
-    episodes_in,
+    episode_groups,
     files_of,
     layout_of,
-    opened,
-    partial_in,
+    open_hdf5,
+    partial_groups,
+    values_of,
 )
-from acwm_formats.hdf5_recordings import HDF5Recordings, Place
+from acwm_formats.hdf5_store import HDF5Group
 from acwm_formats.names import (
     exact,
     is_action,
@@ -68,7 +69,7 @@ class HDF5(Format):
         files = files_of(path)
         if not files:
             return False
-        with opened(first_sound(files, _closed)) as file:
+        with open_hdf5(first_sound(files, _closed)) as file:
             return layout_of(file) is not None
 
     @guarded
@@ -111,7 +112,7 @@ class HDF5(Format):
             raise DataError(f"{first} does not say how many frames it has per second: give --rate")
         stated = exact(rate) if rate else cast(Fraction, layout.rate)
         reader = functools.partial(
-            HDF5Recordings,
+            StoredEpisodes,
             layout=layout,
             rate=stated,
             pixel_range=pair(pixel_range),
@@ -170,25 +171,25 @@ class HDF5(Format):
         return {"root": exported_example(folder, cls())}
 
 
-def _layout(path: Path, video: str | None, actions: str | None, states: str | None) -> Layout:
+def _layout(path: Path, video: str | None, actions: str | None, states: str | None) -> ArrayLayout:
     """The layout of a file, with what the user says in the place of what is known."""
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         known = layout_of(file)
     if known is None and (video is None or actions is None):
         raise DataError(
             f"{path} is in no layout that is known: give --video and --actions, the paths of "
             "frames and actions in the group of an episode"
         )
-    told = Layout("its owner", _paths(video), (actions or "").strip("/"), _paths(states))
+    custom = ArrayLayout("its owner", _paths(video), (actions or "").strip("/"), _paths(states))
     if known is None:
-        return told
-    kind = known.kind if told.actions in ("", known.actions) else None
+        return custom
+    kind = known.kind if custom.actions in ("", known.actions) else None
     return replace(
         known,
-        kind="absolute" if kind is None and "abs" in told.actions.split("_") else kind,
-        cameras=told.cameras or known.cameras,
-        actions=told.actions or known.actions,
-        states=known.states if states is None else told.states,
+        kind="absolute" if kind is None and "abs" in custom.actions.split("_") else kind,
+        cameras=custom.cameras or known.cameras,
+        actions=custom.actions or known.actions,
+        states=known.states if states is None else custom.states,
     )
 
 
@@ -199,23 +200,22 @@ def _paths(text: str | None) -> dict[str, str]:
 
 def _splits(
     files: Sequence[Path],
-    layout: Layout,
-    reader: Callable[[dict[int, Place]], Recordings],
+    layout: ArrayLayout,
+    reader: Callable[[dict[int, StoredEpisode]], Recordings],
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
-    found: dict[Split | None, list[Place]] = {}
-    damaged: list[Place] = []
+    found: dict[Split | None, list[StoredEpisode]] = {}
+    damaged: list[StoredEpisode] = []
     for path in files:
         try:
-            places, tests = _contents(path, layout)
+            groups, tests = _contents(path, layout)
         except DataError as error:
-            damaged.append(Place(path, "/", problem=str(error)))
+            damaged.append(StoredEpisode(HDF5Group(path, "/"), problem=str(error)))
             continue
         own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
-        for place in places:
-            name = place.group.split("/")[-1]
-            split = cast(Split | None, own or (tests and tests.get(name, "train")))
-            found.setdefault(split, []).append(place)
+        for name, episodes in groups.items():
+            of_tests = tests and tests.get(name.split("/")[-1], "train")
+            found.setdefault(cast(Split | None, own or of_tests), []).extend(episodes)
     if damaged and found:
         found.setdefault(None if None in found else "train", []).extend(damaged)
     if damaged and not found:
@@ -224,40 +224,42 @@ def _splits(
         what = " and ".join((layout.actions, *layout.cameras.values()))
         raise DataError(f"{files[0]} has no group with {what}")
     if None in found:
-        return reader(dict(enumerate(place for places in found.values() for place in places)))
-    return {split: reader(dict(enumerate(places))) for split, places in found.items() if split}
+        return reader(dict(enumerate(itertools.chain(*found.values()))))
+    return {split: reader(dict(enumerate(each))) for split, each in found.items() if split}
 
 
-def _contents(path: Path, layout: Layout) -> tuple[list[Place], dict[str, Split] | None]:
-    """The episodes in a file, and the groups of those that it sets aside for tests."""
-    with opened(path) as file:
-        names = episodes_in(file, layout)
-        places = [place for name in names for place in _places(path, file, name, names, layout)]
+def _contents(
+    path: Path, layout: ArrayLayout
+) -> tuple[dict[str, list[StoredEpisode]], dict[str, Split] | None]:
+    """The episodes in a file by their group, and the groups that it sets aside for tests."""
+    with open_hdf5(path) as file:
+        names = episode_groups(file, layout)
+        groups = {name: [*_episodes(path, file, name, names, layout)] for name in names}
         if layout.is_robosuite and names:  # opening one will tell what it lacks
-            places += [Place(path, name) for name in partial_in(file, layout)]
-            places.sort(key=lambda place: natural(place.group))
-        return places, _tests(file)
+            for name in partial_groups(file, layout):
+                groups[name] = [StoredEpisode(HDF5Group(path, name))]
+        return {name: groups[name] for name in sorted(groups, key=natural)}, _tests(file)
 
 
-def _places(
-    path: Path, file: Any, name: str, names: Sequence[str], layout: Layout
-) -> Iterator[Place]:
+def _episodes(
+    path: Path, file: Any, name: str, names: Sequence[str], layout: ArrayLayout
+) -> Iterator[StoredEpisode]:
     """The episodes in a group: one, or several in a row."""
-    bounds = None
+    arrays, bounds = HDF5Group(path, name), None
     try:
         if layout.name != "acwm":
             alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
             bounds = _bounds(file[name], layout, alone=alone)
     except DataError as error:
-        yield Place(path, name, problem=str(error))
+        yield StoredEpisode(arrays, problem=str(error))
         return
     if bounds is None:
-        yield Place(path, name)
+        yield StoredEpisode(arrays)
     for number, (start, stop) in enumerate(bounds or ()):
-        yield Place(path, name, number, start, stop)
+        yield StoredEpisode(arrays, number, start, stop)
 
 
-def _bounds(group: Any, layout: Layout, *, alone: bool) -> Bounds | None:
+def _bounds(group: Any, layout: ArrayLayout, *, alone: bool) -> Bounds | None:
     """The episodes in the rows of a group; None if they are one."""
     count = len(array(group, layout.actions))
     bounds = bounds_in(group, count, alone=alone)
@@ -270,7 +272,7 @@ def _bounds(group: Any, layout: Layout, *, alone: bool) -> Bounds | None:
 def _notes(
     root: Path,
     files: Sequence[Path],
-    layout: Layout,
+    layout: ArrayLayout,
     splits: Recordings | Mapping[Split, Recordings],
     *,
     stated: bool,
@@ -279,12 +281,12 @@ def _notes(
     notes = [layout.note] if layout.note and not stated else []
     notes += unread_note(root, files)
     for path in () if layout.name == "acwm" or layout.is_robosuite else files:
-        with contextlib.suppress(DataError), opened(path) as file:
-            if lacking := partial_in(file, layout):
+        with contextlib.suppress(DataError), open_hdf5(path) as file:
+            if lacking := partial_groups(file, layout):
                 what = " and ".join((layout.actions, *layout.cameras.values()))
                 notes.append(f"Groups of {path.name} without {what}: {', '.join(lacking[:5])}.")
-    with opened(first_sound(files, _closed)) as file:
-        if names := episodes_in(file, layout):
+    with open_hdf5(first_sound(files, _closed)) as file:
+        if names := episode_groups(file, layout):
             group = file[names[0]]
             others = [n for n in group if is_action(n) and n != layout.actions]
             used = {*layout.states.values(), *layout.cameras.values()}
@@ -301,7 +303,7 @@ def _notes(
 
 
 def _closed(path: Path) -> None:
-    opened(path).close()
+    open_hdf5(path).close()
 
 
 def _tests(file: Any) -> dict[str, Split] | None:
@@ -309,10 +311,10 @@ def _tests(file: Any) -> dict[str, Split] | None:
     mask = file.get("mask/valid")
     if not isinstance(mask, h5py.Dataset):
         return None
-    return {bytes(name).decode(): "ind_test" for name in content(mask)}
+    return {bytes(name).decode(): "ind_test" for name in values_of(mask)}
 
 
-def _action(card: EnvironmentCard | None, layout: Layout) -> ActionFacts:
+def _action(card: EnvironmentCard | None, layout: ArrayLayout) -> ActionFacts:
     if card is None:
         return ActionFacts(kind=layout.kind, held=layout.held, ask=layout.is_robosuite)
     spec = card.action
@@ -326,7 +328,7 @@ def _instances(card: EnvironmentCard | None) -> tuple[str, ...]:
 
 def _card(path: Path) -> EnvironmentCard:
     """The card in a file that acwm wrote."""
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         try:
             return DatasetCard.from_dict(parse_json(file.attrs["card"])).environment
         except UNREADABLE as error:

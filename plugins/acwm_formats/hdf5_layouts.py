@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,9 @@ from typing import Any
 import h5py
 
 from acwm_core.arrays import check_unpacked
-from acwm_core.env.card import ActionKind
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched
+from acwm_formats.array_store import ArrayLayout
 from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, tells
 from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.images import CHANNELS, MOST_BYTES
@@ -26,36 +25,6 @@ from acwm_formats.sources import files_in
 
 ENDINGS = (".hdf5", ".h5")
 ALOHA_RATE = Fraction(50)  # the layout does not say it; all of its recorders have a step of 20 ms
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where things lie in the group of an episode.
-
-    Attributes:
-        name: whose layout it is.
-        cameras: path of the frames by the name of the camera.
-        actions: path of the actions.
-        states: path of each state by its name.
-        rate: frames per second; None if the files do not say it.
-        kind: what actions command; None if the files do not say it.
-        note: a sentence for people.
-        held: dimensions of the actions that are absolute in every case, such as a gripper's.
-    """
-
-    name: str
-    cameras: Mapping[str, str]
-    actions: str
-    states: Mapping[str, str] = field(default_factory=dict[str, str])
-    rate: Fraction | None = None
-    kind: ActionKind | None = None
-    note: str = ""
-    held: tuple[int, ...] = ()
-
-    @property
-    def is_robosuite(self) -> bool:
-        """Whether its actions are a robosuite controller's, most of which take steps."""
-        return self.name in ("robomimic", "LIBERO")
 
 
 def files_of(path: Path) -> list[Path]:
@@ -68,7 +37,7 @@ def files_of(path: Path) -> list[Path]:
     return files_in(path, ENDINGS)
 
 
-def opened(path: Path) -> Any:
+def open_hdf5(path: Path) -> Any:
     """Open an HDF5 file that refers to no other.
 
     Raises:
@@ -109,7 +78,7 @@ def array(group: Any, name: str) -> Any:
     return found
 
 
-def content(found: Any, rows: slice | tuple[()] = ()) -> Any:
+def values_of(found: Any, rows: slice | tuple[()] = ()) -> Any:
     """What a dataset holds, or some of its rows; its data lies in the same file.
 
     Raises:
@@ -126,7 +95,7 @@ def _check_own(found: Any) -> None:
         raise DataError(f"{found.file.filename} keeps {found.name} in another file: copy it")
 
 
-def episodes_in(file: Any, layout: Layout) -> list[str]:
+def episode_groups(file: Any, layout: ArrayLayout) -> list[str]:
     """The groups that hold what the layout names, in natural order."""
     found = [
         name
@@ -137,14 +106,14 @@ def episodes_in(file: Any, layout: Layout) -> list[str]:
     return sorted(found, key=natural)
 
 
-def partial_in(file: Any, layout: Layout) -> list[str]:
+def partial_groups(file: Any, layout: ArrayLayout) -> list[str]:
     """The groups that hold a part of what the layout names, and so are no episode."""
     if layout.is_robosuite:
         wanted = [name for name in _groups(file) if re.fullmatch(r"data/[^/]+", name)]
     else:
         paths = (layout.actions, *layout.cameras.values())
         wanted = [n for n in _groups(file) if n != "/" and any(path in file[n] for path in paths)]
-    whole = episodes_in(file, layout)
+    whole = episode_groups(file, layout)
     return sorted({*wanted} - {*whole}, key=natural)
 
 
@@ -155,29 +124,29 @@ def _groups(file: Any) -> Iterator[str]:
     yield from names
 
 
-def layout_of(file: Any) -> Layout | None:
+def layout_of(file: Any) -> ArrayLayout | None:
     """The layout of a file, if it is one that is known."""
     if file.attrs.get("format") == "acwm":
-        return _ours(file)
+        return _acwm_layout(file)
     data = file.get("data")
-    if isinstance(data, h5py.Group) and len(data) and (found := _robomimic(data)):
+    if isinstance(data, h5py.Group) and len(data) and (found := _robomimic_layout(data)):
         return found
     if "action" in file and "observations/images" in file:
-        return _aloha(file)
+        return _aloha_layout(file)
     places = (each for each in (file, data) if isinstance(each, h5py.Group))
-    return next((found for place in places if (found := _in_a_row(place))), None)
+    return next((found for place in places if (found := _concatenated_layout(place))), None)
 
 
-def _ours(file: Any) -> Layout | None:
+def _acwm_layout(file: Any) -> ArrayLayout | None:
     names = sorted(name for name in file if name.startswith("episode_"))
     if not names:
         return None
     states = {name: f"states/{name}" for name in file[names[0]].get("states", ())}
     rate = Fraction(json.loads(file.attrs["card"])["environment"]["fps"]).limit_denominator(10**6)
-    return Layout("acwm", {"video": "video"}, "actions", states, rate)
+    return ArrayLayout("acwm", {"video": "video"}, "actions", states, rate)
 
 
-def _robomimic(data: Any) -> Layout | None:
+def _robomimic_layout(data: Any) -> ArrayLayout | None:
     first: Any = data[sorted(data, key=natural)[0]]
     if not _is_group(first) or "obs" not in first or "actions" not in first:
         return None
@@ -190,23 +159,23 @@ def _robomimic(data: Any) -> Layout | None:
     rows = first["actions"]
     gripper = rows.ndim == 2 and rows.shape[1] == control.arm + 1 > 1
     held = (control.arm,) if gripper else ()
-    return Layout(name, cameras, "actions", states, control.rate, control.kind, held=held)
+    return ArrayLayout(name, cameras, "actions", states, control.rate, control.kind, held=held)
 
 
 def _is_group(item: Any) -> bool:
     return isinstance(item, h5py.Group)
 
 
-def _aloha(file: Any) -> Layout:
+def _aloha_layout(file: Any) -> ArrayLayout:
     images, length = file["observations/images"], len(file["action"])
     cameras = {name: f"observations/images/{name}" for name in images}
     seen = file["observations"]
     states = {name: f"observations/{name}" for name in seen if is_numbers(seen[name], length)}
     note = "50 frames per second, which ALOHA's recorders have and its files do not say."
-    return Layout("ALOHA", cameras, "action", states, ALOHA_RATE, "absolute", note)
+    return ArrayLayout("ALOHA", cameras, "action", states, ALOHA_RATE, "absolute", note)
 
 
-def _in_a_row(group: Any) -> Layout | None:
+def _concatenated_layout(group: Any) -> ArrayLayout | None:
     """Arrays of all episodes in a row, with others that say where each begins or ends."""
     actions = next((name for name in ("action", "actions") if name in group), "")
     if not actions or not isinstance(group[actions], h5py.Dataset):
@@ -218,7 +187,7 @@ def _in_a_row(group: Any) -> Layout | None:
     states = {n: n for n in group if is_numbers(group[n], length) and not is_bound(n, actions)}
     ours = {"ep_len", "ep_offset"} <= {*group}
     name = "stable-worldmodel" if ours else "arrays of all episodes"
-    return Layout(name, cameras, actions, states)
+    return ArrayLayout(name, cameras, actions, states)
 
 
 def is_bound(name: str, actions: str) -> bool:
@@ -246,7 +215,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
             if not _is_group(part):
                 continue
             found = {
-                _qualified(prefix, name): content(item)
+                _qualified(prefix, name): values_of(item)
                 for name, item in part.items()
                 if isinstance(item, h5py.Dataset)
                 and item.ndim in (1, 2)

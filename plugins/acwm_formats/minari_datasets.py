@@ -27,8 +27,8 @@ from acwm_core.files import check_fetched, parse_json
 from acwm_formats.channels import Channels, named
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, Images, file_stamp, regular_times, stack_note
-from acwm_formats.hdf5_layouts import array, content
-from acwm_formats.hdf5_recordings import Place, StoredImages, rows, shared_file
+from acwm_formats.hdf5_layouts import array, values_of
+from acwm_formats.hdf5_store import HDF5Group, shared_file
 from acwm_formats.images import CHANNELS
 from acwm_formats.names import exact, natural, pair, text_note, typed, word
 from acwm_formats.sources import damage_of, files_in, guarded
@@ -42,7 +42,6 @@ SAME_COUNT = (
     "observation is the one after its action: then --shift -1 is right"
 )
 MAIN = "main_data.hdf5"
-WHOLE = Place(Path(), "")
 
 
 class Minari(Format):
@@ -263,18 +262,18 @@ def _described(root: Path, _: str) -> _Stored:
 
 def _from_hdf5(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:
     """Observations and actions of an episode; images are read when they are asked for."""
-    path = data / MAIN
-    group = shared_file(path)[stored.episodes[index]]
+    arrays = HDF5Group(data / MAIN, stored.episodes[index])
+    group = arrays.group
     is_dict, seen = isinstance(stored.observations, gymnasium.spaces.Dict), _Seen()
     for name, space in _parts(stored.observations).items():
         where = f"observations/{name}" if is_dict else "observations"
         if _shows(space):
-            seen[name] = StoredImages(path, f"{group.name}/{where}", len(array(group, where)))
+            seen[name] = arrays.images(where)
         elif isinstance(space, Text):
-            seen[name] = [bytes(text).decode() for text in content(array(group, where))]
+            seen[name] = [bytes(text).decode() for text in values_of(array(group, where))]
         elif isinstance(group.get(where), h5py.Dataset) and group[where].dtype.kind in "fiub":
-            seen[name] = rows(array(group, where), WHOLE)
-    return seen, rows(array(group, "actions"), WHOLE)
+            seen[name] = arrays.rows(where)
+    return seen, arrays.rows("actions")
 
 
 def _from_arrow(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:

@@ -6,9 +6,7 @@ import contextlib
 import functools
 import itertools
 import math
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -21,14 +19,15 @@ from zarr.storage import ZipStore
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
-from acwm_formats.channels import Channels, named
+from acwm_formats.array_store import ArrayLayout, ArrayStore, StoredEpisode, StoredEpisodes
+from acwm_formats.channels import Channels
 from acwm_formats.episode_bounds import bounds_of, tells
 from acwm_formats.format import Format
-from acwm_formats.frames import MOST_FRAMES, ImageFrames, regular_times, stack_note
+from acwm_formats.frames import MOST_FRAMES, stack_note
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import exact, pair, typed, word, words
 from acwm_formats.sources import damage_of, guarded
-from acwm_formats.timeline import RecordedDataset, Samples, TimedRecording
+from acwm_formats.timeline import RecordedDataset
 
 ENDS = "meta/episode_ends"
 PLACES = (
@@ -120,12 +119,14 @@ class ZarrReplay(Format):
             missing = "actions: give --actions NAME" if cameras else "images: give --video NAME"
             raise DataError(f"data/ of {root} has {', '.join(found)}, and no {missing}")
         others = [n for n in found if n not in (*cameras, *action) and found[n].ndim == 2]
-        kept = tuple(_chosen(buffer, states, found, others))
+        kept = _chosen(buffer, states, found, others)
         options = {"rate": rate, "video": video, "actions": actions, "states": states}
         name = Path(root).resolve().name
         options["channels"] = channels
-        recordings = ZarrRecordings(
-            buffer, tuple(cameras), action[0], kept, exact(rate), pair(pixel_range), channels
+        seen, known = {n: n for n in cameras}, {n: n for n in kept}
+        layout = ArrayLayout("replay buffer", seen, action[0], known)
+        recordings = StoredEpisodes(
+            buffer.episodes(), layout, exact(rate), pair(pixel_range), channels
         )
         used = {*cameras, *action, *kept}
         return RecordedDataset(
@@ -155,49 +156,7 @@ class ZarrReplay(Format):
         return {"root": place, "rate": 10.0}
 
 
-@dataclass(frozen=True)
-class ZarrRecordings:
-    """The episodes of a replay buffer, opened on request."""
-
-    buffer: Buffer
-    cameras: tuple[str, ...]
-    actions: str
-    states: tuple[str, ...]
-    rate: Fraction
-    pixel_range: tuple[float, float] | None
-    channels: Channels | None = None
-
-    def __len__(self) -> int:
-        """The number of episodes."""
-        return len(self.buffer.ends)
-
-    def __getitem__(self, index: int) -> TimedRecording:
-        """Open one episode."""
-        with damage_of(self.buffer.root):
-            return self._opened(index)
-
-    def _opened(self, index: int) -> TimedRecording:
-        start, stop = [0, *self.buffer.ends][index : index + 2]
-        times = regular_times(stop - start, self.rate)
-
-        def rows(name: str) -> Samples:
-            return Samples(self.buffer.rows(f"data/{name}", start, stop))
-
-        cameras = {
-            name: ImageFrames(
-                StoredImages(self.buffer, name, start, stop),
-                times,
-                self.pixel_range,
-                channels=named(name, self.channels),
-                stamp=f"{name} {start} {stop}",
-            )
-            for name in self.cameras
-        }
-        states = {name: rows(name) for name in self.states}
-        return TimedRecording(f"episode {index}", cameras, rows(self.actions), states, self.rate)
-
-
-def _notes(recordings: ZarrRecordings, left: list[str]) -> tuple[str, ...]:
+def _notes(recordings: StoredEpisodes, left: list[str]) -> tuple[str, ...]:
     """What people should know about how the buffer was read."""
     notes = [f"Arrays that were left out: {', '.join(left)}."] if left else []
     with contextlib.suppress(DataError):
@@ -205,47 +164,30 @@ def _notes(recordings: ZarrRecordings, left: list[str]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-@dataclass(frozen=True)
-class StoredImages(Sequence[Any]):
-    """Images `start` to `stop` of an array, read one by one."""
-
-    buffer: Buffer
-    name: str
-    start: int
-    stop: int
-
-    def __len__(self) -> int:
-        return self.stop - self.start
-
-    def __getitem__(self, index: Any) -> Any:
-        place = self.start + index
-        return self.buffer.rows(f"data/{self.name}", place, place + 1)[0]
-
-
-class Buffer:
-    """The arrays of a replay buffer; opened anew in every process.
+class Buffer(ArrayStore):
+    """The arrays of a replay buffer, opened anew in every process.
 
     Raises:
         DataError: it is no Zarr group that can be read.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self._found: dict[str, Any] = {}
-        with damage_of(root), _pointers_named(root):
-            if root.is_file():
-                with ZipFile(root) as packed:
+        with damage_of(path), _pointers_named(path):
+            if path.is_file():
+                with ZipFile(path) as packed:
                     sizes = (member.file_size for member in packed.infolist())
-                    check_unpacked(root.stat().st_size, sum(sizes))
-            store: Any = ZipStore(root, mode="r") if root.is_file() else str(root.absolute())
+                    check_unpacked(path.stat().st_size, sum(sizes))
+            store: Any = ZipStore(path, mode="r") if path.is_file() else str(path.absolute())
             self._group: Any = zarr.open_group(store, mode="r")
 
     def __reduce__(self) -> Any:
-        return Buffer, (self.root,)
+        return Buffer, (self.path,)
 
     def names(self) -> list[str]:
         """The names of the arrays in ``data``."""
-        with damage_of(self.root / "data"), _pointers_named(self.root / "data"):
+        with damage_of(self.path / "data"), _pointers_named(self.path / "data"):
             return sorted(name for name, _ in self._group["data"].arrays())
 
     def array(self, name: str) -> Any:
@@ -256,29 +198,41 @@ class Buffer:
         """
         if name in self._found:
             return self._found[name]
-        with damage_of(self.root / name), _pointers_named(self.root / name):
+        with damage_of(self.path / name), _pointers_named(self.path / name):
             array = self._group[name]
             codecs = [*array.filters, *array.compressors]
             used = [getattr(codec, "codec_id", type(codec).__name__) for codec in codecs]
         if array.dtype.kind not in "fiub" or not {*used} <= {*CODECS}:
-            raise DataError(f"{name} of {self.root} holds {array.dtype} by {used}, not numbers")
+            raise DataError(f"{name} of {self.path} holds {array.dtype} by {used}, not numbers")
         chunk = math.prod(array.chunks) * array.dtype.itemsize
         if max(chunk / 2, math.prod(array.shape[1:]) * array.dtype.itemsize) > MOST_BYTES:
             raise DataError(
-                f"{name} of {self.root} claims rows {list(array.shape[1:])} in chunks of {chunk:,} "
+                f"{name} of {self.path} claims rows {list(array.shape[1:])} in chunks of {chunk:,} "
                 "bytes, more than are read"
             )
         self._found[name] = array
         return array
 
-    def rows(self, name: str, start: int, stop: int | None) -> NDArray[Any]:
-        """Rows `start` to `stop` of an array."""
+    def length(self, name: str) -> int:
+        """As in `ArrayStore`."""
+        return self.array(f"data/{name}").shape[0]
+
+    def rows(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """As in `ArrayStore`."""
+        return self._rows(f"data/{name}", start, stop)
+
+    def _rows(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         array = self.array(name)
         count = (array.shape[0] if stop is None else stop) - start
         if count * math.prod(array.shape[1:]) * array.dtype.itemsize > 4 * MOST_BYTES:
-            raise DataError(f"{name} of {self.root} claims {count:,} rows, more than are read")
-        with damage_of(f"{name} of {self.root}"), _pointers_named(self.root / name):
+            raise DataError(f"{name} of {self.path} claims {count:,} rows, more than are read")
+        with damage_of(f"{name} of {self.path}"), _pointers_named(self.path / name):
             return np.asarray(array[start:stop])
+
+    def episodes(self) -> dict[int, StoredEpisode]:
+        """The episodes by number; raises as `ends`."""
+        bounds = enumerate(itertools.pairwise([0, *self.ends]))
+        return {number: StoredEpisode(self, number, *rows) for number, rows in bounds}
 
     @functools.cached_property
     def ends(self) -> list[int]:
@@ -289,19 +243,19 @@ class Buffer:
         """
         place = next((each for each in (*PLACES, *NUMBERED) if each in self._group), ENDS)
         if (count := self.array(place).shape[0]) > MOST_FRAMES:
-            raise DataError(f"{place} of {self.root} claims {count:,} episodes")
+            raise DataError(f"{place} of {self.path} claims {count:,} episodes")
         if place in NUMBERED:
-            numbers, name = self.rows(place, 0, None), place.rpartition("/")[2]
-            whole = bounds_of({name: numbers}, len(numbers), f"{place} of {self.root}")
+            numbers, name = self._rows(place), place.rpartition("/")[2]
+            whole = bounds_of({name: numbers}, len(numbers), f"{place} of {self.path}")
             return [stop for _, stop in whole or [(0, len(numbers))]]
         if place != ENDS and not place.endswith("episode_ends"):
-            lengths = self.rows(place, 0, None)
+            lengths = self._rows(place)
             count, name = int(lengths.sum()), place.rpartition("/")[2]
-            whole = bounds_of({name: lengths}, count, f"{place} of {self.root}") or [(0, count)]
+            whole = bounds_of({name: lengths}, count, f"{place} of {self.path}") or [(0, count)]
             return [stop for _, stop in whole]
-        ends = [int(end) for end in self.rows(place, 0, None)]
+        ends = [int(end) for end in self._rows(place)]
         if not ends or any(end <= start for start, end in itertools.pairwise([0, *ends])):
-            raise DataError(f"{ENDS} of {self.root} does not grow with each episode: {ends[:5]}")
+            raise DataError(f"{ENDS} of {self.path} does not grow with each episode: {ends[:5]}")
         return ends
 
 
@@ -328,5 +282,5 @@ def _chosen(
     names = default if text is None else list(words(text))
     for name in names:
         if name not in found:
-            raise DataError(f"{buffer.root} has no data/{name}{suggest(name, found)}")
+            raise DataError(f"{buffer.path} has no data/{name}{suggest(name, found)}")
     return names
