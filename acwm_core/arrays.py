@@ -63,7 +63,7 @@ def read_npy(file: IO[bytes], size: int, check: Callable[..., None] | None = Non
         head = io.BytesIO(file.read(_LONGEST_HEADER))
         version = np.lib.format.read_magic(head)
         if version not in _HEADERS:
-            raise ValueError("its arrays are no plain numbers")
+            raise ValueError("its arrays are not plain numbers")
         shape, _, dtype = _HEADERS[version](head)
         if dtype.hasobject or dtype.names or not dtype.itemsize:
             raise ValueError(f"it holds {dtype}, not plain numbers or text")
@@ -121,7 +121,7 @@ def _read_npz(
             for member in members:
                 name = member.filename.removesuffix(".npy")
                 if name == member.filename or name in arrays:
-                    why = "is there twice" if name in arrays else "is no array"
+                    why = "occurs twice" if name in arrays else "is no array"
                     raise ValueError(f"its member {member.filename} {why}")
                 with archive.open(member) as opened:
                     named = functools.partial(check, name) if check else None
@@ -129,7 +129,7 @@ def _read_npz(
                     if opened.read(1):
                         raise ValueError(f"its member {name} has more than its header says")
     except _UNSOUND as error:
-        raise ValueError(f"it is no sound NPZ ({error})") from error
+        raise ValueError(f"it is not a valid NPZ file ({error})") from error
     return arrays
 
 

@@ -159,7 +159,9 @@ def made_whole(folder: Path) -> Generator[Path]:
             made.mkdir(parents=True)
             yield made
             if folder.exists() and any(folder.iterdir()):
-                raise DataError(f"another command has made {folder} meanwhile: use that one")
+                raise DataError(
+                    f"another command has created {folder} in the meantime: use that one"
+                )
             made.replace(folder)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
@@ -261,7 +263,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
                 remove_partial(path.parent, f"{path.name}.")
                 yield True
                 return
-        message = f"waiting for another command, which is making {path}{_holder(lock)}"
+        message = f"waiting for another command, which is writing {path}{_holder(lock)}"
         warnings.warn(message, AcwmWarning, stacklevel=3)
     with _locked(lock, -1 if wait else 0) as is_held:
         if is_held:
@@ -347,7 +349,7 @@ def regular_file(folder: Path, name: str) -> Path:
         why = getattr(error, "strerror", None) or error
         raise DataError(f"{path} cannot be read ({why})") from error
     if not stat.S_ISREG(mode):
-        raise DataError(f"{path} is no regular file: put the file itself there")
+        raise DataError(f"{path} is not a regular file: put the file itself there")
     return path
 
 
@@ -445,7 +447,7 @@ def check_regular(path: Path) -> None:
         OSError: it does not exist or cannot be reached.
     """
     if not stat.S_ISREG(path.stat().st_mode):
-        raise DataError(f"{path} is no file: it is a folder, a pipe, a socket or a device")
+        raise DataError(f"{path} is not a file: it is a folder, a pipe, a socket or a device")
 
 
 def check_fetched(path: Path) -> None:

@@ -55,7 +55,7 @@ KINDS = {
     "executor": ("acwm_core.executors:Executor", "runs work elsewhere"),
     "protocol": (
         "acwm_core.evaluation.protocol:Protocol",
-        "which clips an evaluation predicts, and tables that were measured so",
+        "which clips an evaluation predicts, and published scores on them",
     ),
     "trained_model": ("pathlib:Path", "a run folder; of NAME://ADDRESS, made from an address"),
     "command": ("click:Command", "a command of acwm; its module imports nothing heavy"),

@@ -125,8 +125,8 @@ class CodecChecks(Suite):
         video, kept = self._clip(), self._clip()
         before = {name: value.clone() for name, value in self._codec.state_dict().items()}
         same = torch.equal(self._codec.encode(video), self._codec.encode(video))
-        expect(same, "the same clip encodes to other latents a second time")
-        expect(torch.equal(video, kept), "encoding changes the video that it is given")
+        expect(same, "encoding the same clip again gives other latents")
+        expect(torch.equal(video, kept), "encoding changes its input video")
         for name, value in self._codec.state_dict().items():
             expect(torch.equal(value, before[name]), f"encoding changes {name}")
 

@@ -71,7 +71,7 @@ class ConditionerChecks(Suite):
         named = made.conditioner is self._conditioner
         expect(named, "the Conditioning names another conditioner")
         empty = made.modulation is None and made.context is None
-        expect(not empty, "it gives neither modulation nor context")
+        expect(not empty, "it returns neither modulation nor context")
 
     def shapes_follow_the_length(self) -> None:
         """Give one entry per latent frame, with the model's width, for any length."""
@@ -117,7 +117,7 @@ class ConditionerChecks(Suite):
         """With a `history`, embed a latent frame the same way without any earlier actions."""
         history = self._conditioner.history
         if history is None:
-            raise NotTried("it names no `history`")
+            raise NotTried("it does not declare its `history`")
         expect_is_a(history, int)
         steps = max(1, history) + 1  # a stream keeps these, for its last two latent frames
         actions = self._actions(latent_frames=steps + 3)

@@ -70,7 +70,7 @@ class EnvironmentChecks(TaskChecks):
         expect(action.size > 0, "the action has no dimension")
         expect(card.instances[1:], "the card names nothing but the background in `instances`")
         for names in (action.names, [f.name for f in card.factors], [s.name for s in card.state]):
-            expect(len(set(names)) == len(names), f"a name comes twice in {', '.join(names)}")
+            expect(len(set(names)) == len(names), f"a name occurs twice in {', '.join(names)}")
 
     def card_survives_json(self) -> None:
         """Survive a round trip through JSON, since datasets store the card in a file."""
@@ -91,9 +91,9 @@ class EnvironmentChecks(TaskChecks):
                 outside = factor.severity(value) > 0
                 expect(outside, f"{factor.name}={value} must lie outside training")
         names = [factor.name for factor in card.factors]
-        expect(card.ood_shifts, "ood_shifts is empty: ood_test would be as training")
+        expect(card.ood_shifts, "ood_shifts is empty: ood_test would equal training")
         for name in card.ood_shifts:
-            expect(name in names, f"ood_shifts names {name!r}, which is no factor of the card")
+            expect(name in names, f"ood_shifts names {name!r}, which is not a factor of the card")
 
     def splits_are_labelled(self) -> None:
         """In `ood_test`, shift the factors of `ood_shifts` in turn; shift none in other splits."""
@@ -182,7 +182,7 @@ class EnvironmentChecks(TaskChecks):
         differ = self._looks_different(
             usual, lambda: rng.uniform(action.low, action.high, action.size)
         )
-        expect(differ, "other actions lead to the very same video")
+        expect(differ, "other actions lead to the same video")
 
     def still_action_is_possible(self) -> None:
         """Provide an action that asks for no motion, within the bounds."""
@@ -202,12 +202,12 @@ class EnvironmentChecks(TaskChecks):
         )
         expect(same.digests() == usual.digests(), "a perturbation of 0 changes the episode")
         alike = moved.digests() == again.digests()
-        expect(alike, "the same spec is not perturbed the same way twice")
+        expect(alike, "perturbing the same spec twice gives different starts")
         starts = ((usual.states[name][0], values[0]) for name, values in moved.states.items())
         unmoved = all(np.array_equal(*pair) for pair in starts)
         expect(not unmoved, "a perturbation changes nothing in the state of the first frame")
         first, *_, last = np.abs(moved.video.astype(float) - usual.video).mean((1, 2, 3)) / 255
-        expect(first < CLOSE, f"a perturbed start is seen: it differs by {first:.1%} on average")
+        expect(first < CLOSE, f"a perturbed start is visible: it differs by {first:.1%} on average")
         what = f"without any action the picture differs by {last:.2%} soon, {first:.2%} at first"
         expect(last < 3 * first + CLOSE / 4, f"a perturbed start is not at rest: {what}")
 
@@ -219,7 +219,7 @@ class EnvironmentChecks(TaskChecks):
         whole = {each.name for each in group(*card.symmetries)}
         found = {each.name for each in card.symmetries}
         lacking = ", ".join(sorted(whole - found))
-        expect(found == whole, f"the symmetries are no group: {lacking} follows from them")
+        expect(found == whole, f"the symmetries do not form a group: {lacking} follows from them")
         for symmetry in card.symmetries:
             actions = symmetry.of_actions(self.beginning.actions)
             turned = simulate(

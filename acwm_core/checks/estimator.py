@@ -115,7 +115,7 @@ class EstimatorChecks(Suite):
             there = self._estimator.pixels(field, true)
             expect_equal(f"pixels of {field!r} are", there.shape, (*true.shape[:-1], 2))
             inside = (there >= -0.5 * height) & (there <= [1.5 * width, 1.5 * height])
-            expect(inside.all(), f"{field!r} appears far out of the frame")
+            expect(inside.all(), f"{field!r} appears far outside the frame")
 
     def reads_frames_of_every_size(self) -> None:
         """Read larger frames, too, and refuse frames that do not have the card's size."""
@@ -134,7 +134,7 @@ class EstimatorChecks(Suite):
         """Give the same result twice, without changing the video."""
         first, video = self._observation, self._video.clone()
         second = self._estimator.estimate(self._video)
-        expect(torch.equal(video, self._video), "it changes the video that it is given")
+        expect(torch.equal(video, self._video), "it changes its input video")
         expect(np.array_equal(second.masks, first.masks), "a second reading's masks differ")
         for name, values in first.states.items():
             same = np.array_equal(values, second.states[name], equal_nan=True)

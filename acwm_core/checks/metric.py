@@ -149,7 +149,7 @@ class MetricChecks(Suite):
         first, second = (self._raw_scores(prediction) for _ in range(2))
         expect(np.array_equal(first, second, equal_nan=True), "a second scoring differs")
         same = torch.equal(video, prediction.video) and torch.equal(target, prediction.target)
-        expect(same, "it changes the video that it is given")
+        expect(same, "it changes its input video")
         for name, values in states.items():
             same = np.array_equal(values, prediction.states[name], equal_nan=True)
             expect(same, f"it changes state {name!r}")

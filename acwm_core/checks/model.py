@@ -124,7 +124,7 @@ class DynamicsChecks(PredictionTrial):
         listed = self._model.matrices()
         expect_is_a(listed, list)
         found = [id(each) for each in listed]
-        expect({*found} <= own, "matrices lists what is no parameter of the model")
+        expect({*found} <= own, "matrices lists something that is not a parameter of the model")
         expect(len({*found}) == len(found), "matrices lists a parameter twice")
         wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
         expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
@@ -203,7 +203,7 @@ class DynamicsChecks(PredictionTrial):
         """Let `predict_frames` return the same frames as `forward`."""
         model = self._model
         if not (isinstance(model, Predictor) and model.implements("predict_frames")):
-            raise NotTried("it saves no work for frames that nobody asks for")
+            raise NotTried("it saves no work when fewer frames are requested")
         latents, modulation = self._inputs()
         batch, frames = SHAPE[:2]
         numbers = torch.arange(batch)[:, None] % (frames - 1)

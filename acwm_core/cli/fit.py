@@ -58,7 +58,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     if composed.env:
         make = f"`acwm generate {composed.env.name} --out {path}` (for a small model, --size 64)"
     if isinstance(resume, Path):
-        make = f"{make}, or name its new place, data.path=…"
+        make = f"{make}, or set data.path=… to its new place"
     Dataset("dataset", "card.yaml", make).convert(path, None, None)
 
     wait_without_spinning()
@@ -93,7 +93,7 @@ def _recipe_to_resume(run: Path, words: Sequence[str], out: Path | None) -> Reci
     folder = RunFolder(run)
     folder.check_resumable()
     if out is not None and out.resolve() != run.resolve():
-        raise TrainingError(f"resume={run} continues the run where it is: leave out --out {out}")
+        raise TrainingError(f"resume={run} continues the run where it is: omit --out {out}")
     has_name = bool(words) and not _OVERRIDE.match(words[0])
     overrides = words[1:] if has_name else words
     kept = compose(folder.recipe, overrides)

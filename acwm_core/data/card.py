@@ -151,7 +151,7 @@ class DatasetCard:
         others = {name: value for name, value in values.items() if name != "environment"}
         card = cls(environment=EnvironmentCard.from_dict(values["environment"]), **others)
         if not set(card.splits) <= set(SPLITS):  # they are names of folders
-            raise ValueError(f"{dict(card.splits)} are no splits")
+            raise ValueError(f"{dict(card.splits)} are not splits")
         for split, statistics in card.actions.items():
             if not all(math.isfinite(n) for row in statistics.values() for n in row):
                 raise ValueError(f"the actions' statistics of {split} are not finite numbers")

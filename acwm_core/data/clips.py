@@ -79,11 +79,11 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         if self.states and self.reader != "random_access":
-            raise RecipeError("data.states are read by data.reader=random_access only")
+            raise RecipeError("data.states needs data.reader=random_access")
         if self.growing and (self.fraction != 1 or self.reader != "random_access"):
             raise RecipeError(
-                "data.growing takes all that there is by data.reader=random_access: leave out "
-                "data.fraction and data.reader, or data.growing"
+                "data.growing uses all episodes and needs data.reader=random_access: "
+                "omit data.fraction and data.reader, or data.growing"
             )
 
 

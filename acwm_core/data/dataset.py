@@ -142,8 +142,8 @@ class EpisodeDataset:
         if len(self.lengths) != wanted and not growing:
             raise DataError(
                 f"{split} of {path} holds {len(self.lengths)} of its {wanted} episodes: run the "
-                "command that made it again to add the others, or train beside it with "
-                "data.growing=true"
+                "command that made it again to add the others, or train while it "
+                "runs with data.growing=true"
             )
         self.checksum = self.card.identity if growing else manifest.checksum()
         self.shards = [(record.first, record.episodes) for record in records]
@@ -262,7 +262,7 @@ def _finished(path: str | Path, card: DatasetCard, manifest: Manifest) -> list[S
             records.append(record)
             episodes += record.episodes
     if not records:
-        raise DataError(f"no shard of {path} is finished yet: start again once there are some")
+        raise DataError(f"no shard of {path} is finished yet: start again once one is")
     return records
 
 
@@ -276,8 +276,8 @@ def declared_symmetries(episodes: EpisodeDataset) -> tuple[Symmetry, ...]:
     if not card.symmetries:
         raise DataError(
             f"the card of {episodes.path} declares no symmetries of {card.name}: train without "
-            "data.symmetries; if its environment has some by now, the command that made the data "
-            "adds them to the card"
+            "data.symmetries; if its environment declares some now, run the command that made the "
+            "data again, which adds them to the card"
         )
     return card.symmetries
 

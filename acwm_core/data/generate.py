@@ -97,10 +97,10 @@ def generate(
         if split not in SPLITS:
             raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
         if count < 0:
-            raise RecipeError(f"{count} episodes of {split} cannot be made")
+            raise RecipeError(f"{count} episodes of {split} are impossible: give 0 or more")
     counts: dict[Split, int] = {s: episodes[s] for s in SPLITS if episodes.get(s)}
     if not counts:
-        raise RecipeError("there are no episodes to make: every split has 0")
+        raise RecipeError("no episodes were requested: every split has 0")
     wanted = DatasetCard(
         environment=card,
         splits=counts,

@@ -169,7 +169,7 @@ def encode_windows(
             AcwmWarning,
             stacklevel=2,
         )
-    instead = "or train without by data.cache_latents=false"
+    instead = "or train without them, with data.cache_latents=false"
     with writing(folder.path, instead), contextlib.ExitStack() as stack:
         folder.path.mkdir(parents=True, exist_ok=True)
         folder.keep_card()

@@ -226,8 +226,8 @@ def _shared(batch: Any) -> Any:
     except RuntimeError as error:
         total = f" of {shutil.disk_usage(SHARED).total / 2**20:.0f} MB" if SHARED.exists() else ""
         return DataError(
-            f"the shared memory {SHARED}{total}, through which workers send clips, is full: give a "
-            "container more by --shm-size=8g, or set data.workers=0 or a smaller data.batch_size "
+            f"the shared memory {SHARED}{total}, through which workers send clips, is full: start "
+            "a container with --shm-size=8g, or set data.workers=0 or a smaller data.batch_size "
             f"({str(error).splitlines()[0][:80]})"
         )
     return batch

@@ -37,8 +37,8 @@ def make_environment(
     made = component.create_as(Environment, **(options or {}))
     if made.card.name != component.name:
         raise PluginError(
-            f"environment {component.name!r} has a card with the name {made.card.name!r}: data is "
-            "known by that of the card, so give it the name under which it is registered"
+            f"environment {component.name!r} has a card with the name {made.card.name!r}: data "
+            "carries the name of the card, so give the card the registered name"
         )
     return made
 

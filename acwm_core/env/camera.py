@@ -50,8 +50,7 @@ class Camera:
         forward = np.subtract(self.target, self.eye).astype(np.float64)
         if not np.linalg.norm(np.cross(forward, self.up)) > 1e-9:
             raise ShapeError(
-                "a camera's eye and target are two places, and up is another direction than the "
-                "one it looks in"
+                "a camera's eye and target must differ, and up must not be the direction of view"
             )
         if not 0 < self.fov < 180:
             raise ShapeError(f"a camera's fov lies between 0 and 180 degrees, not {self.fov:g}")

@@ -126,7 +126,9 @@ class EnvironmentCard:
     def __post_init__(self) -> None:
         check_scene(self.state, self.instances)
         if self.views and self.camera:
-            raise ShapeError(f"frames of {self.name} show several views, which no one camera sees")
+            raise ShapeError(
+                f"frames of {self.name} show several views, which no single camera sees"
+            )
         if self.light is not None and not (
             len(self.light) == 3 and 0 < math.hypot(*self.light) < math.inf
         ):
@@ -250,7 +252,7 @@ def plain_rate(fps: float | Fraction | str) -> float:
     except (ValueError, OverflowError, ZeroDivisionError, TypeError):
         rate = Fraction(0)
     if rate <= 0:
-        raise ShapeError(f"{fps!r} is no rate: give frames per second, such as 30 or 30000/1001")
+        raise ShapeError(f"{fps!r} is not a rate: give frames per second, such as 30 or 30000/1001")
     return rate.numerator if rate.denominator == 1 else float(rate)
 
 

@@ -151,7 +151,7 @@ class StateField:
         known, shape = get_args(Kind), list(self.shape)
         for kind in self.kinds:
             if kind not in known:
-                yield f"has the kind {kind!r}: choose of {', '.join(known)}"
+                yield f"has the kind {kind!r}: choose one of {', '.join(known)}"
         if not isinstance(self.kind, str):
             yield from self._problems_of_pose()
         elif self.kind in _GRIDS and not (
@@ -178,7 +178,7 @@ class StateField:
         if self.symmetry not in allowed:
             yield (
                 f"has the symmetry {self.symmetry!r}, which no {' or '.join(self.kinds)} has: "
-                f"choose of {', '.join(sorted(allowed))}"
+                f"choose one of {', '.join(sorted(allowed))}"
             )
         if len(self.instances) > 1 and len(self.instances) != self.rows:
             yield f"has {self.rows} rows and {len(self.instances)} instances: give one per row"
@@ -207,12 +207,12 @@ def check_scene(state: Sequence[StateField], instances: Sequence[str]) -> None:
         who = f"the state field {each.name!r}"
         for name in (each.present, *each.follows):
             if name and name not in by_name:
-                raise ShapeError(f"{who} refers to {name!r}, which is no field of the state")
+                raise ShapeError(f"{who} refers to {name!r}, which is not a field of the state")
         for name in each.instances:
             if name not in instances:
                 raise ShapeError(
-                    f"{who} belongs to {name!r}, which is no instance: choose of "
-                    f"{', '.join(instances)}"
+                    f"{who} belongs to {name!r}, which is not an instance: choose "
+                    f"one of {', '.join(instances)}"
                 )
         if each.present:
             present = by_name[each.present]

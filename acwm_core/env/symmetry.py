@@ -54,7 +54,7 @@ class Symmetry:
         for axes in (self.actions, *self.states.values()):
             if sorted(map(abs, axes)) != list(range(1, len(axes) + 1)):
                 raise ShapeError(
-                    f"{list(axes)} is no signed permutation: give the numbers 1 to {len(axes)}, "
+                    f"{list(axes)} is not a signed permutation: give the numbers 1 to {len(axes)}, "
                     "each once, with a minus where the sign changes"
                 )
 
@@ -151,7 +151,9 @@ def group(*generators: Symmetry) -> tuple[Symmetry, ...]:
     while new:
         for each in new:
             if found.setdefault(each.name, each) != each:
-                raise ShapeError(f"there are two symmetries {each.name!r}: they are no group")
+                raise ShapeError(
+                    f"there are two symmetries {each.name!r}: they do not form a group"
+                )
         pairs = itertools.product(list(found.values()), repeat=2)
         products = [both for second, first in pairs if (both := second.after(first)) is not None]
         new = [each for each in products if found.get(each.name) != each]

@@ -148,7 +148,7 @@ class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArr
         names = environment.card.instances
         if not isinstance(cast(object, task), Task):
             raise PluginError(
-                f"a task of {environment.card.name} is {task!r:.60}, which is no Task"
+                f"a task of {environment.card.name} is {task!r:.60}, which is not a Task"
             )
         steps = isinstance(task.max_steps, Integral) and task.max_steps >= 1
         near = isinstance(task.tolerance, Real) and task.tolerance >= 0

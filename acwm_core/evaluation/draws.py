@@ -108,7 +108,7 @@ def metrics_for(metrics: Mapping[str, Metric], samples: int) -> dict[str, Metric
     of_one = {name: metric for name, metric in metrics.items() if not metric.of_draws}
     if metrics and not of_one:
         raise RecipeError(
-            f"{', '.join(metrics)} judge several draws of a clip together: name another metric in "
-            "evaluation.metrics that scores one"
+            f"{', '.join(metrics)} judge several draws of a clip together: add a metric of "
+            "single draws to evaluation.metrics"
         )
     return dict(metrics) if samples > 1 else of_one

@@ -186,7 +186,7 @@ def open_run(folder: RunFolder, overrides: Sequence[str]) -> tuple[Recipe, Evalu
     for override in overrides:
         if not override.startswith("evaluation."):
             raise RecipeError(
-                f"{override!r} is no setting of the evaluation; it takes overrides such as "
+                f"{override!r} is not a setting of the evaluation; it takes overrides such as "
                 "evaluation.steps=10"
             )
     recipe = compose(folder.recipe, overrides, sections=["evaluation"])
@@ -204,8 +204,9 @@ def evaluator_of(
     """An `Evaluator` with the metrics of `config` that can be measured here."""
     if not config.metrics:
         raise RecipeError(
-            "evaluation.metrics must name at least one: let the recipe extend base.yaml, which "
-            "lists the usual ones, or add evaluation.metrics=[NAME] (see `acwm list metric`)"
+            "evaluation.metrics must name at least one: let the recipe extend base.yaml, "
+            "which lists the default metrics, or add evaluation.metrics=[NAME] (see `acwm list "
+            "metric`)"
         )
     estimator = estimator_for(card)
     asked = build_metrics(config.metrics, config.metric_options)
@@ -308,8 +309,8 @@ def _report_range(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
         if least < low - slack or most > high + slack:
             warnings.warn(
                 f"{dataset.split} of {dataset.path} has the action {name} from {least:.3g} to "
-                f"{most:.3g}, the model was trained on {low:.3g} to {high:.3g}: beyond, it "
-                "extrapolates",
+                f"{most:.3g}, the model was trained on {low:.3g} to {high:.3g}: beyond "
+                "that range it extrapolates",
                 AcwmWarning,
                 stacklevel=2,
             )
@@ -322,7 +323,7 @@ def choose_device(name: str, option: str = "evaluation.device=") -> torch.device
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError):
-        raise RecipeError(f"{option}{name}: there is no such device here") from None
+        raise RecipeError(f"{option}{name}: this machine has no such device") from None
 
 
 def _summarise(

@@ -133,7 +133,7 @@ class Prediction:
         """
         self.check_shapes()
         if self.estimator is None:
-            raise PluginError(f"nothing reads states from video of {self.card.name}")
+            raise PluginError(f"no estimator reads states from video of {self.card.name}")
         return self.estimator.read(self.video)
 
     @functools.cached_property
@@ -312,7 +312,7 @@ class Metric(ABC):
 
     def summed_up(self, values: Numbers, weights: Numbers | None = None) -> float:
         """Call `summarise`; errors get a note that names the metric."""
-        with noting(f"in metric {self.name!r} as it sums clips up", self):
+        with noting(f"in metric {self.name!r} while summarising clips", self):
             return float(self.summarise(values, weights))
 
     def summarise(self, values: Numbers, weights: Numbers | None = None) -> float:
@@ -345,7 +345,7 @@ class SetMetric(Metric):
 
     def distance_of(self, clips: Sequence[object]) -> float:
         """Call `distance` on the `features` of clips; errors get a note as in `summed_up`."""
-        with noting(f"in metric {self.name!r} as it sums clips up", self):
+        with noting(f"in metric {self.name!r} while summarising clips", self):
             return float(self.distance(np.asarray(clips, np.float32)))
 
     def per_frame(self, prediction: Prediction) -> NDArray[np.float64]:

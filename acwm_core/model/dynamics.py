@@ -310,7 +310,9 @@ class Cache(ABC):
 
     def __init__(self, context: int) -> None:
         if context < 2:
-            raise RecipeError(f"a context of {context} latent frames remembers nothing: at least 2")
+            raise RecipeError(
+                f"a context of {context} latent frames remembers nothing: give at least 2"
+            )
         self.context = context
         self.frames = 0
 

@@ -321,7 +321,7 @@ class WorldModel(nn.Module):
         stride = self.codec.temporal_stride
         if video.ndim != 5 or video.shape[2] != 3 or (video.shape[1] - 1) % stride:
             raise ShapeError(
-                f"a model is given frames [B, 3, H, W] or [B, K, 3, H, W], K = 1 + n·"
+                f"a model takes frames [B, 3, H, W] or [B, K, 3, H, W], K = 1 + n·"
                 f"{stride}, not {list(given.shape)}"
             )
         return self._as_own(video)

@@ -152,7 +152,7 @@ def _without_retired(
         if name in params and kept is not ... and params[name] != kept:
             raise RecipeError(
                 f"{section}.{name}={types.show(params[name])}: {component.name} has no parameter "
-                f"{name!r} any more, and does what {types.show(kept)} did"
+                f"{name!r} any more, and behaves like {types.show(kept)} did"
             )
     return {name: value for name, value in params.items() if name not in component.retired}
 

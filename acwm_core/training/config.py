@@ -127,6 +127,6 @@ class TrainingConfig:
         object.__setattr__(self, "betas", tuple(self.betas))  # YAML gives lists
         if self.ignore_mismatched_sizes and self.init_from is None:
             raise RecipeError(
-                "training.ignore_mismatched_sizes=True goes with training.init_from=RUN, whose "
-                "weights it is about"
+                "training.ignore_mismatched_sizes=True needs training.init_from=RUN, "
+                "whose weights it concerns"
             )

@@ -195,12 +195,12 @@ def _check_meaning(config: TrainingConfig, card: EnvironmentCard) -> None:
             "its weights mean something else"
         )
         if not config.ignore_mismatched_sizes:
-            anyway = "training.ignore_mismatched_sizes=true starts from them all the same"
+            anyway = "training.ignore_mismatched_sizes=true starts from them anyway"
             raise TrainingError(f"{message}: {anyway}")
     elif (card.action.low, card.action.high) != (before.action.low, before.action.high):
         message = (
-            f"the bounds of the actions are not those of {name}, so what it learnt of their size "
-            "is off by as much at first"
+            f"the bounds of the actions differ from those of {name}, so at first "
+            "the model misjudges their size"
         )
     if message and is_first_process():
         warnings.warn(message, AcwmWarning, stacklevel=2)
@@ -228,7 +228,7 @@ def _start_from(
     if ignore_mismatched:
         others = load_fitting_weights(world_model, initial.weights)
         if others:
-            message = f"initialised randomly, as {name} has none that fit: {', '.join(others)}"
+            message = f"initialised randomly, because {name} has none that fit: {', '.join(others)}"
             warnings.warn(message, AcwmWarning, stacklevel=2)
         return all_training(name, initial)
     try:
@@ -297,7 +297,7 @@ def _explained(trainer: L.Trainer, run: RunFolder, preemption: Preemption) -> Ge
         if run.recipe.exists():
             raise
         raise TrainingError(
-            f"{run.path} was removed or moved while it was trained: train it again"
+            f"{run.path} was removed or moved during training: train it again"
         ) from error
     except RuntimeError as error:
         if "DataLoader worker" in str(error):

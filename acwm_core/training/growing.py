@@ -84,8 +84,9 @@ class GrowingClipData(ClipData):
         seen = int(strategy.reduce(there, reduce_op="min"))  # what all processes see
         if count is not None and seen < count:
             raise DataError(
-                f"{self.episodes.path} holds {seen} finished episodes, and this run was trained "
-                f"on {count}: make them again with `{self.episodes.card.command(self.config.path)}`"
+                f"{self.episodes.path} holds {seen} finished episodes, but this run was "
+                f"trained on {count}: simulate them again with "
+                f"`{self.episodes.card.command(self.config.path)}`"
             )
         held = self._split[1]
         self._split = range(len(held), count or seen), held

@@ -162,7 +162,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
         wanted = tuple(expected[name].shape) if name in expected else "absent"
         if found != wanted:
             raise TrainingError(
-                f"{path} does not fit the recipe: {name} is {found}, the model wants it {wanted}"
+                f"{path} does not fit the recipe: {name} is {found}, the model expects {wanted}"
             )
     _take(expected, weights)
 
@@ -185,7 +185,7 @@ def load_fitting_weights(world_model: WorldModel, path: Path) -> list[str]:
         if name in weights and weights[name].shape == value.shape
     }
     if not fitting:
-        raise TrainingError(f"not one weight of {path} fits the recipe's model by name and shape")
+        raise TrainingError(f"no weight of {path} fits the recipe's model by name and shape")
     _take(fitting, weights)
     return sorted({*expected} - {*fitting})
 
@@ -196,7 +196,7 @@ def _stored(path: Path, facts: Mapping[str, Any]) -> dict[str, Tensor]:
     if facts.get("sha256") not in (None, digest(weights)):  # None in old files
         raise TrainingError(
             f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
-            "or have training write it again with resume=auto"
+            "or let training write it again with resume=auto"
         )
     check_finite(path, weights)
     return weights

@@ -62,7 +62,7 @@ class RunFolder:
         """Refuse a folder with weights and without checkpoints, as of a trained model."""
         if self.weights.exists() and not any(self.checkpoints.glob("*last.ckpt*")):
             raise TrainingError(
-                f"{self.path} holds weights and no checkpoint to resume from: start from them by "
+                f"{self.path} holds weights but no checkpoint to resume from: start from them with "
                 f"training.init_from={self.path}, and train into another folder"
             )
 
@@ -127,5 +127,5 @@ def run_to_write(name: str | Path) -> Path:
                         shutil.copytree(source, partial, dirs_exist_ok=True)
     ours, theirs = copy / weights, source / weights
     if not ours.is_file() or not filecmp.cmp(theirs, ours, shallow=False):
-        raise TrainingError(f"{copy} holds something else than this {name}: move it away")
+        raise TrainingError(f"{copy} holds something other than this {name}: move it away")
     return copy

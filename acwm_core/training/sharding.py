@@ -102,7 +102,7 @@ class ShardedStrategy(ModelParallelStrategy):
             checkpoint = read_whole(path)
             weights = checkpoint.pop("state_dict")
             if missing := without_codec(module.state_dict()).keys() - weights.keys():
-                raise TrainingError(f"{path} has no {min(missing)}: it is of another model")
+                raise TrainingError(f"{path} has no {min(missing)}: it belongs to another model")
             set_model_state_dict(module, weights, options=options)
             (saved,) = checkpoint.pop("optimizer_states")
             names = [name for group in own["param_groups"] for name in group["params"]]

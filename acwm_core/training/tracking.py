@@ -93,8 +93,11 @@ def begin(logger: Logger) -> None:
         name, why = type(logger).__name__, " ".join(str(error).split())[:300]
         todo = "choose another trainer.logger"
         if isinstance(logger, WandbLogger):
-            todo = "log in by `wandb login`, or set WANDB_MODE=offline and send it by `wandb sync`"
-        raise TrainingError(f"{name} cannot begin ({why}): {todo}") from error
+            todo = (
+                "log in with `wandb login`, or set WANDB_MODE=offline and upload the run later "
+                "with `wandb sync`"
+            )
+        raise TrainingError(f"{name} cannot start ({why}): {todo}") from error
 
 
 def _ids(run: RunFolder) -> dict[str, str]:

@@ -75,8 +75,8 @@ def build_trainer(
     elif isinstance(strategy, others) or str(strategy).startswith(("fsdp", "deepspeed")):
         name = strategy if isinstance(strategy, str) else type(strategy).__name__
         raise TrainingError(
-            f"{name} shards the weights in a way that their moving average and checkpoints cannot "
-            "follow: use trainer.strategy=fsdp or hsdp, or ddp if all fits on one device"
+            f"{name} shards the weights in a way that their moving average and checkpoints "
+            "do not support: use trainer.strategy=fsdp or hsdp, or ddp if all fits on one device"
         )
     plugins = _listed(chosen.pop("plugins", None))
     if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
@@ -145,7 +145,7 @@ def _check_saves(flags: Mapping[str, Any]) -> None:
     for wrong, message in (
         (
             flags.get("enable_checkpointing") is False or bool(flags.get("barebones")),
-            "training that saves no checkpoint leaves no model: leave out "
+            "training that saves no checkpoint leaves no model: omit "
             "trainer.enable_checkpointing and trainer.barebones; "
             "training.checkpoint_every_n_steps=N saves more rarely",
         ),
@@ -155,8 +155,8 @@ def _check_saves(flags: Mapping[str, Any]) -> None:
         ),
         (
             bool(flags.get("overfit_batches")),
-            "clips are an endless stream, which trainer.overfit_batches does not hold: train on "
-            "fewer episodes by data.fraction",
+            "trainer.overfit_batches does not work with an endless stream of clips: "
+            "train on fewer episodes with data.fraction",
         ),
     ):
         if wrong:
@@ -169,17 +169,17 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
     for wrong, message in (
         (
             flags.get("accelerator") in ("gpu", "cuda") and not found,
-            "there is no GPU here that PyTorch can use: train on the CPU by "
-            "trainer.accelerator=cpu trainer.devices=1, or the small config of a recipe by +small",
+            "PyTorch finds no GPU here: train on the CPU with "
+            "trainer.accelerator=cpu trainer.devices=1, or use +small",
         ),
         (
             flags.get("max_epochs") not in (None, -1),
-            "training counts steps, its clips have no end: set trainer.max_steps=… in place of "
-            "trainer.max_epochs",
+            "training counts steps, not epochs: set trainer.max_steps=… "
+            "instead of trainer.max_epochs",
         ),
         (
             is_endless and flags.get("max_time") is None,
-            "nothing says how long to train: set trainer.max_steps=… or "
+            "the length of the training is missing: set trainer.max_steps=… or "
             "trainer.max_time=DD:HH:MM:SS",
         ),
         (
@@ -195,7 +195,7 @@ def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
         (
             str(flags.get("precision")) in ("16-true", "bf16-true"),
             f"trainer.precision={flags.get('precision')} keeps the weights in 16 bits, which "
-            "swallow small updates; use bf16-mixed",
+            "loses small updates; use bf16-mixed",
         ),
     ):
         if wrong:

@@ -43,7 +43,7 @@ def benchmark() -> None:
     "--seed",
     type=click.IntRange(0),
     default=0,
-    help="Any but 0 is a secret set: tasks do not tell it.",
+    help="Any but 0 makes a secret set: the tasks do not contain the seed.",
 )
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 def export(words: tuple[str, ...], out: Path, **others: Any) -> None:

@@ -120,7 +120,7 @@ def evaluation_config(overrides: Sequence[str]) -> EvaluationConfig:
     for override in overrides:
         if not override.startswith("evaluation."):
             raise RecipeError(
-                f"{override!r} is no setting of the evaluation; tasks take such as "
+                f"{override!r} is not a setting of the evaluation; tasks take settings such as "
                 "evaluation.context_frames=5"
             )
     settings = read_recipe(recipe_folder() / "base.yaml", overrides)["evaluation"]

@@ -15,6 +15,6 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "score",
         "acwm_benchmark.commands:score",
-        summary="score what any program predicted",
+        summary="score the predictions of any program",
         after="benchmark",
     )

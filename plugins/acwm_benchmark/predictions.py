@@ -49,7 +49,7 @@ class Predictions:
             if coding_of(path) != found:
                 raise DataError(
                     f"{path} is {coding_of(path) or 'lossless'}, but {first} is "
-                    f"{found or 'lossless'}: hand all predictions of a world in in one way"
+                    f"{found or 'lossless'}: submit all predictions of a world in one way"
                 )
         return found
 
@@ -115,9 +115,9 @@ def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predi
             if name in wanted:
                 found.setdefault(name, {})[draw] = path  # it is not missing
         elif name not in wanted:
-            faults.append(f"{path} is of no task{suggest(name, wanted)}")
+            faults.append(f"{path} belongs to no task{suggest(name, wanted)}")
         elif draw in found.setdefault(name, {}):
-            faults.append(f"{name}: {found[name][draw].name} and {path.name} are both of it")
+            faults.append(f"{name}: {found[name][draw].name} and {path.name} both belong to it")
         else:
             found[name][draw] = path
     faults += [f"{name}: its prediction is missing" for name in wanted if name not in found]

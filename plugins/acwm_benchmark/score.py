@@ -130,7 +130,7 @@ def with_draws(config: EvaluationConfig, draws: int) -> EvaluationConfig:
     """
     if draws > 1 and config.samples not in (1, draws):
         raise DataError(
-            f"there are {draws} draws of each task, but the tasks ask for {config.samples}, or for "
-            "one of a model that draws nothing"
+            f"there are {draws} draws of each task, but the tasks ask for {config.samples}, "
+            "or one of a deterministic model"
         )
     return replace(config, samples=max(draws, config.samples))

@@ -62,7 +62,7 @@ class World:
     def __post_init__(self) -> None:
         plain_name(self.name, "a world")
         if not set(self.checksums) <= set(SPLITS):
-            raise ValueError(f"{', '.join(self.checksums)} are no splits")
+            raise ValueError(f"{', '.join(self.checksums)} are not splits")
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,7 @@ def read_array(
         DataError: it is damaged, or holds something else or more.
     """
     if (size := path.stat().st_size) > most_bytes + OVERHEAD:
-        raise DataError(
-            f"{path.name} has {size:,} bytes, more than the {most_bytes:,} that are asked for"
-        )
+        raise DataError(f"{path.name} has {size:,} bytes, more than the {most_bytes:,} allowed")
 
     def is_wanted(found: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if found != name:

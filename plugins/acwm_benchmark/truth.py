@@ -52,8 +52,9 @@ def truth_of(
     for split, each in datasets.items():
         if each.checksum != world.checksums[split]:
             raise DataError(
-                f"{path} holds other episodes of {split} than the tasks are of "
-                f"({each.checksum[:8]}, not {world.checksums[split][:8]}): give the organiser's "
+                f"{path} holds other episodes of {split} than "
+                f"the tasks ({each.checksum[:8]}, not {world.checksums[split][:8]}): give the "
+                "organiser's "
                 "data with --data, or simulate it on the same kind of processor with the "
                 "same versions"
             )

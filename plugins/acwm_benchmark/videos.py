@@ -178,7 +178,7 @@ def _size_of(path: Path) -> tuple[int, int]:
     with path.open("rb") as file:
         start = file.read(24)
     if len(start) < 24 or not start.startswith(SIGNATURE) or start[12:16] != b"IHDR":
-        raise DataError(f"{path.name} is no PNG")
+        raise DataError(f"{path.name} is not a PNG")
     width, height = struct.unpack(">II", start[16:])
     return height, width
 

@@ -28,8 +28,8 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE, RUN
     type=RUN,
     multiple=True,
     metavar="RUN",
-    help="Train the decoder on what this model predicts of DATA, too; for several models of "
-    "several worlds.",
+    help="Also train the decoder on this model's predictions of DATA; repeat for models "
+    "of several worlds.",
 )
 @click.option(
     "--freeze-coarse",

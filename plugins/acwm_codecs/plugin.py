@@ -28,7 +28,7 @@ def register_codecs(registry: Registry) -> None:
     registry.add(
         "compact_reference",
         "acwm_codecs.compact_reference:CompactReference",
-        summary="the latents of compact, decoded with the given frame: what stands still is kept",
+        summary="the latents of compact, decoded with the given frame: keeps what stands still",
     )
     registry.add(
         "compact_per_frame",

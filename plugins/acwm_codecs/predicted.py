@@ -70,7 +70,7 @@ class Predictions:
         for world, (run, bundle) in self._models.items():
             if world not in self._used:
                 size = "×".join(map(str, bundle.card.frame_size))
-                raise DataError(f"{run} predicts {world} at {size}, of which there are no data")
+                raise DataError(f"{run} predicts {world} at {size}, of which no data was given")
         return [
             {"model": run.name, "sha256": read_metadata(RunFolder(run).weights)["sha256"]}
             for run, _ in self._models.values()

@@ -246,8 +246,8 @@ class Training:
         state: Any = load_plain(path)
         if state["record"] != json.dumps(record):
             raise DataError(
-                f"{path} is of a training that was interrupted, with other settings: repeat its "
-                "command to go on, or remove the file"
+                f"{path} belongs to an interrupted training with other settings: repeat "
+                "its command to continue, or remove the file"
             )
         self.step = state["step"]
         self.codec.load_state_dict(state["codec"])
@@ -327,7 +327,7 @@ def train_on(
 
 def _check_asked(out: Path, start: str, decoder_only: bool) -> None:
     if out.suffix != ".safetensors":
-        raise DataError(f"--out {out} must end in .safetensors, as that is what it will be")
+        raise DataError(f"--out {out} must end in .safetensors")
     if decoder_only and start == "random":
         raise DataError(
             "--decoder-only, --predicted-by and --freeze-coarse keep an encoder: not --start random"
@@ -362,7 +362,7 @@ def begun(kind: type[Compact], start: str, file: Path) -> Compact:
 
 def _freeze_coarse(codec: Compact) -> None:
     if not isinstance(codec, CompactReference):
-        raise DataError(f"--freeze-coarse goes with --codec compact_reference, not {codec.name}")
+        raise DataError(f"--freeze-coarse needs --codec compact_reference, not {codec.name}")
     codec.freeze_coarse()
 
 

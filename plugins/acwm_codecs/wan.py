@@ -171,7 +171,8 @@ def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
         raise DataError(f"codec {codec!r}: {path} cannot be read: {first_line(error)}") from None
     except pickle.UnpicklingError:
         raise DataError(
-            f"codec {codec!r}: {path} holds other things than tensors, or none, and is not opened"
+            f"codec {codec!r}: {path} holds something other than tensors, or nothing, and is not "
+            "opened"
         ) from None
     autoencoder = build(AutoencoderKLWan, widths, path, codec)
     load_strictly(autoencoder, converted, path, codec)

@@ -24,8 +24,8 @@ from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, RUN
 @click.option(
     "--mode",
     type=click.Choice(["whole", "windows", "stream"]),
-    help="All frames at once; clip by clip; or a few at a time with the model's state carried on. "
-    "By default as the model was trained for.",
+    help="All frames at once; clip by clip; or a few at a time, keeping the model's state. By "
+    "default the mode that the model was trained for.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Sampling steps; the recipe's by default.")
 @click.option(
@@ -35,7 +35,7 @@ from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, RUN
     "--samples",
     default=1,
     type=click.IntRange(1),
-    help="Number of draws to show side by side, of a model that draws.",
+    help="Number of draws of a stochastic model to show side by side.",
 )
 def rollout(run: Path, out: Path | None, **options: object) -> None:
     """Predict one video with the model of RUN.

@@ -121,8 +121,8 @@ def rollout_run(
     where = model.action_low.device
     if samples > 1 and not model.samples:
         raise RecipeError(
-            f"this model draws nothing: all {samples} predictions would be the same one, so leave "
-            "--samples out"
+            f"this model is deterministic: all {samples} predictions would be "
+            "equal, so omit --samples"
         )
     inputs = torch.tensor(rows)[None].to(where)
     check_pixels(given)
@@ -149,14 +149,14 @@ def _recorded(
         video, rows = _simulate_episode(DatasetCard.read(RunFolder(run).card), split, episode)
     context = bundle.world_model.context_frames
     if len(video) <= context:
-        raise DataError(f"episode {episode} has {len(video)} frames, and {context} are given")
+        raise DataError(f"episode {episode} has {len(video)} frames, but {context} are given")
     return video, rows
 
 
 def _read_start(image: Path, bundle: RunBundle) -> Clip:
     context = bundle.world_model.context_frames
     if context > 1:
-        raise RecipeError(f"this model starts from {context} frames, and --image gives one")
+        raise RecipeError(f"this model starts from {context} frames, but --image gives one")
     return _read_image(image, bundle.card.frame_size)[None]
 
 
@@ -232,7 +232,7 @@ def _simulate_episode(
         raise DataError(f"episode {episode}: give 0 or more")
     name = card.environment.name
     if card.source or name not in catalog().registry("environment"):
-        raise DataError(f"no simulator of {name} is installed: give a dataset of it by --data")
+        raise DataError(f"no simulator of {name} is installed: give a dataset of it with --data")
     simulated = simulate(make_environment(name, card.options), card.spec(split, episode))
     return as_clip(simulated.video), simulated.actions
 
@@ -244,7 +244,7 @@ def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
         if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
             warnings.warn(
                 f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
-                "pixels: crop it before, if it should keep its shape",
+                "pixels: crop it first to keep its proportions",
                 AcwmWarning,
                 stacklevel=2,
             )

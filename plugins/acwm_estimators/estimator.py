@@ -177,7 +177,7 @@ class FittedEstimator(NetworkEstimator):
         record = training_record(Path(weights))
         if "layout" not in record:
             raise DataError(
-                f"{weights} does not say what it reads: it is of `acwm_estimators.train`"
+                f"{weights} does not say what it reads: it comes from `acwm_estimators.train`"
             )
         layout = layout_from_dict(record["layout"])
         super().__init__(card, layout, fitted_physics(layout), Path(weights))

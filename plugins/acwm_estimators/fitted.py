@@ -62,7 +62,7 @@ def fitted_layout(
     card = dataset.card.environment
     if len(card.instances) < 2:
         raise DataError(
-            f"{dataset.path} has no masks that name instances, which a network learns from: import "
+            f"{dataset.path} has no masks that name instances, from which a network learns: import "
             "it with masks, or threshold a colour (`acwm new estimator NAME`)"
         )
     masks, states = _samples(dataset, most)

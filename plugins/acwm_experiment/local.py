@@ -93,7 +93,7 @@ class LocalRunner:
         for step in [each for each in waiting.values() if not unsettled & {*each.needs}]:
             failed = [name for name in step.needs if name in failures]
             if failed and (step.kind != "report" or len(failed) == len(step.needs)):
-                failures[step.name] = f"left out, as it needs {failed[0]}"
+                failures[step.name] = f"skipped, because it needs {failed[0]}"
                 del waiting[step.name]
             elif self._free:
                 with _signals_delayed():  # a process that is not listed yet would not be stopped

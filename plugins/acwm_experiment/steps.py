@@ -170,7 +170,7 @@ def training_progress(run: RunSpec) -> float:
         differences.append(f"trainer.max_steps was {steps}, is {run.max_steps}")
     if differences:
         raise TrainingError(
-            f"{run.folder} holds another run than the experiment asks for: "
+            f"{run.folder} holds another run than the experiment needs: "
             f"{'; '.join(differences)}; choose another --out, or delete it"
         )
     return steps / run.max_steps

@@ -146,7 +146,9 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
         frames = {name: _frame_stream(found, name, recording.cameras[name]) for name in cameras}
         main = frames[cameras[0]]
         if len(main.times) < 2:
-            found.found(f"it has {len(main.times)} usable frames, and an action leads on", "")
+            found.found(
+                f"it has {len(main.times)} usable frames, and an action needs the next one", ""
+            )
             return found
         seconds = float(main.times[-1] - main.times[0])
         _check_span(seconds, 1 / main.step)
@@ -170,8 +172,8 @@ def _check_span(seconds: float, rate: float) -> None:
     """Refuse times of which one is so far off that the frames between would fill the memory."""
     if not seconds * rate <= MOST_FRAMES:
         raise DataError(
-            f"its frames span {seconds:.4g} s, and at {rate:.4g} frames/s these are more than "
-            f"{MOST_FRAMES:,}: a time is wrong, or in another unit"
+            f"its frames span {seconds:.4g} s, and at {rate:.4g} frames/s that is more "
+            f"than {MOST_FRAMES:,}: a time is wrong, or in another unit"
         )
 
 
@@ -194,10 +196,10 @@ def _compare(
     """Compare what the source claims with what its frames show; says how many of them count."""
     said, count, slots = recording.length, len(measured.slots), measured.places
     if said is not None and said not in (count, slots, slots + measured.late):
-        found.found(f"it is said to have {said} frames, and has {count}")
+        found.found(f"it claims {said} frames, but has {count}")
     if recording.rate and options.fps is None and not measured.is_at(recording.rate):
-        rates = f"{float(recording.rate):g} frames/s, and has {measured.rate:.4g}"
-        found.found(f"it is said to have {rates}", "--fps")
+        rates = f"{float(recording.rate):g} frames/s, but has {measured.rate:.4g}"
+        found.found(f"it claims {rates}", "--fps")
     return said if said is not None and 2 <= said < count else None
 
 
@@ -208,7 +210,7 @@ def _grid(found: Aligned, frames: _Stream, measured: Cadence, options: Alignment
         count = int(np.ceil(length / step - options.tolerance * measured.step / step))
         return _Grid(frames.times[0] + step * np.arange(count), step)
     if measured.irregular and options.fps is None:
-        found.found(f"its frames come at no constant rate: {measured.irregular}", "--fps")
+        found.found(f"its frame rate is not constant: {measured.irregular}", "--fps")
     moments = np.arange(measured.places)
     return _Grid(np.interp(moments, measured.slots, frames.times), measured.step)
 
@@ -352,7 +354,7 @@ def _tell_cuts(
 ) -> None:
     """Tell what lies outside the runs; more than a few frames are a defect."""
     if not runs:
-        found.found("frames, actions and states have no two moments in common", "")
+        found.found("frames, actions and states overlap in fewer than two moments", "")
         return
     count, known = len(grid.times), bool(found.defects)
     first = runs[0][0] - max(options.shift, 0)  # a shift leaves out as many, as it was asked to
@@ -382,7 +384,7 @@ def _held(
     known = (place >= 0) & ((place < last) | ~due)
     known &= ~lost | (hole <= options.max_gap * grid.step + slack)
     if filled := int(np.sum(lost & known)):
-        found.notes.append(f"{filled} missing of {name} were filled with what was before")
+        found.notes.append(f"{filled} missing of {name} were filled with the value before")
     return stream.values[before], known
 
 

@@ -58,7 +58,7 @@ def cadence(times: NDArray[np.float64]) -> Cadence:
         slots = slots.astype(np.int64)
         start, step = _line(slots, times)
     off = np.abs(times - start - step * slots).max() / step
-    why = f"one is {off:.2g} frame intervals off its time" if off > HALF else ""
+    why = f"one frame is {off:.2g} frame intervals off its time" if off > HALF else ""
     late = round(float(times[0]) / step)  # unless the clock began long before
     return Cadence(slots, step, late if 0 < late <= len(times) else 0, why)
 
@@ -85,7 +85,7 @@ def faults(times: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[str]]:
     same = kept & ~back & (times == np.concatenate([[-np.inf], latest])[: len(times)])
     if same.any():
         place = int(np.argmax(same))
-        problems.append(f"{np.sum(same)} have the time of the one before: {times[place]:.6g} s")
+        problems.append(f"{np.sum(same)} have the time of the frame before: {times[place]:.6g} s")
     return kept & ~back & ~same, problems
 
 

@@ -208,6 +208,7 @@ def _replay_problem(stored: Episode, again: Episode) -> str | None:
     if not other:
         return None
     return (
-        f"simulated again, it differs in {' and '.join(other[:2])}: the dataset was made with "
+        f"simulated again, the episode differs in {' and '.join(other[:2])}: the dataset was "
+        "made with "
         "another version of the simulator"
     )

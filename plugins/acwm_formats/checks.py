@@ -61,7 +61,7 @@ class FormatChecks(Suite):
 
     def documents_its_options(self) -> None:
         """Read or write, and give every parameter a type and a description in the docstring."""
-        expect(issubclass(self.target, Format), "it is no Format")
+        expect(issubclass(self.target, Format), "it is not a Format")
         expect(self.target.reads() or self.target.writes(), "it neither reads nor writes")
         for method in (self.target.read, self.target.write):
             if method in (Format.read, Format.write):
@@ -70,15 +70,17 @@ class FormatChecks(Suite):
                 name = parameter.name
                 expect(parameter.annotation is not inspect.Parameter.empty, f"{name} has no type")
                 expect(text, f"Args of the docstring do not say what {name} is")
-                expect(name not in TAKEN, f"{name} is an option of every format: call it otherwise")
+                expect(
+                    name not in TAKEN, f"{name} is an option of every format: choose another name"
+                )
 
     def detects_its_example(self) -> None:
         """Know its own example, if that is a path, and no folder that is empty."""
         (empty := self._folder / "empty").mkdir()
-        expect(not self.target.detect(empty), "an empty folder is said to be in this format")
+        expect(not self.target.detect(empty), "it recognises an empty folder")
         (path, *_) = [*self._example.values(), None]
         if self.target.reads() and isinstance(path, Path):
-            expect(self.target.detect(path), "it does not know its own example")
+            expect(self.target.detect(path), "it does not recognise its own example")
 
     def imports_its_example(self) -> None:
         """Import the example as valid datasets, which are the same at a second import."""
@@ -89,7 +91,7 @@ class FormatChecks(Suite):
             findings = check_dataset(self._folder / "first" / at)
             problems = [str(finding) for finding in findings if finding.problem]
             expect(not problems, "; ".join(problems))
-            expect("train" in card.splits, "nothing is there to train on")
+            expect("train" in card.splits, "there is nothing to train on")
             again = _datasets(self.make().read(**self._example))[at]
             same = _imported(again, self._folder / "second" / at) == card
             expect(same, "a second import differs")
@@ -110,7 +112,7 @@ class FormatChecks(Suite):
         """Read the same episodes from what it wrote, if it does both."""
         if not (self.target.reads() and self.target.writes()):
             raise NotTried("it is not both read and written")
-        expect(self.target.detect(self._exported), "it does not know what it wrote")
+        expect(self.target.detect(self._exported), "it does not recognise what it wrote")
         datasets = _datasets(self.make().read(self._exported))
         expect(len(datasets) == 1, f"it reads {len(datasets)} datasets")
         back = _imported(next(iter(datasets.values())), self._folder / "back")
@@ -120,7 +122,7 @@ class FormatChecks(Suite):
             for one, other in zip(before, after, strict=True):
                 expect(np.allclose(one.actions, other.actions, atol=1e-5), "actions change")
                 error = np.mean((one.video.astype(float) - other.video) ** 2)
-                expect(error < 255**2 / 10 ** (MIN_PSNR / 10), "the video comes back as another")
+                expect(error < 255**2 / 10 ** (MIN_PSNR / 10), "the video comes back changed")
 
 
 def _read_backwards(recorded: RecordedDataset) -> None:
@@ -131,7 +133,7 @@ def _read_backwards(recorded: RecordedDataset) -> None:
             name = episode_name(split, index)
             one, other = (_arrays(opened(r, index, name, 1.0)) for r in (recordings, copy))
             same = all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
-            expect(same, f"recording {index} of {split} is another when it is read first")
+            expect(same, f"recording {index} of {split} differs when it is read first")
 
 
 def _arrays(recording: TimedRecording) -> list[Any]:

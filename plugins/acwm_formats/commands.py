@@ -252,8 +252,8 @@ def import_format(
     datasets = {".": recorded} if isinstance(recorded, RecordedDataset) else recorded
     if options.environment and len(datasets) > 1:
         raise DataError(
-            f"--environment {options.environment} would name {len(datasets)} datasets alike: "
-            "import one folder at a time, or leave it out"
+            f"--environment {options.environment} would give {len(datasets)} datasets the "
+            "same name: import one folder at a time, or omit it"
         )
     for name, dataset in datasets.items():
         card = import_dataset(dataset, out / name, options, workers=workers)
@@ -266,8 +266,8 @@ def import_format(
         camera = height, width // max(1, len(card.environment.views))
         if (smaller := small_size(camera)) != camera:
             click.echo(
-                f"· frames of {camera[0]}×{camera[1]} train slowly: --size "
-                f"{smaller[0]}x{smaller[1]} is what the recipe small is for"
+                f"· frames of {camera[0]}×{camera[1]} train slowly: the "
+                f"recipe small is made for --size {smaller[0]}x{smaller[1]}"
             )
         click.echo(f"next: acwm fit small data.path={out / name}")
 

@@ -26,7 +26,7 @@ from acwm_core.errors import DataError, RecipeError
 @click.option(
     "--symmetries",
     is_flag=True,
-    help="Also as each symmetry on the card of the data transforms it.",
+    help="Also encode the clips as each symmetry on the data's card transforms them.",
 )
 @click.option("--batch-size", type=click.IntRange(1), default=8, help="Clips per batch.")
 @click.option(

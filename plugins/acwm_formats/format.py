@@ -118,8 +118,8 @@ def detected_format(path: Path) -> str:
         return matches[0]
     names = ", ".join(matches or (component.name for component in catalog().registry("format")))
     if path.suffix in ARCHIVES:
-        raise DataError(f"{path} is an archive: unpack it, and import the folder that comes out")
-    what = "is in several formats" if matches else "is in no format that is known"
+        raise DataError(f"{path} is an archive: unpack it, and import the folder")
+    what = "is in several formats" if matches else "is in no known format"
     raise DataError(f"{path} {what}: give --format, one of {names}")
 
 

@@ -178,7 +178,9 @@ def _index(path: Path, _: str) -> VideoIndex:
         if stream.codec_context.color_trc in HDR:
             raise DataError(f"the video {path} has a high dynamic range: convert it to SDR first")
         if frame.rotation % 90:
-            raise DataError(f"the video {path} is turned by {frame.rotation}°, no quarter turn")
+            raise DataError(
+                f"the video {path} is turned by {frame.rotation}°, not by quarter turns"
+            )
         turns = frame.rotation // 90 % 4
         aspect = stream.sample_aspect_ratio or Fraction(1)
         width = round(frame.width * aspect) if aspect > 0 else frame.width
@@ -229,7 +231,7 @@ def _opened(path: Path) -> Generator[tuple[Any, Any]]:
     check_fetched(path)
     kind = container_of(path)
     if kind is None:
-        raise DataError(f"{path} is no MP4, MOV, MKV, WebM, AVI or GIF file")
+        raise DataError(f"{path} is not an MP4, MOV, MKV, WebM, AVI or GIF file")
     place = str(path.absolute())  # "concat:a" would be a protocol of FFmpeg
     try:
         with av.open(place, "r", format=kind, metadata_errors="replace") as container:
@@ -361,7 +363,7 @@ def regular_times(count: int, rate: float | Fraction) -> NDArray[np.float64]:
         DataError: there are more than `MOST_FRAMES`.
     """
     if count > MOST_FRAMES:
-        raise DataError(f"it claims {count:,} frames, and {MOST_FRAMES:,} are read at most")
+        raise DataError(f"it claims {count:,} frames, but at most {MOST_FRAMES:,} are read")
     return np.arange(count) / float(rate) if math.isfinite(rate) else np.zeros(count)
 
 

@@ -105,11 +105,11 @@ class HDF5(Format):
         root = Path(root)
         files = files_of(root)
         if not files:
-            raise DataError(f"{root} is no HDF5 file and holds none")
+            raise DataError(f"{root} is not an HDF5 file and contains none")
         first = first_sound(files, _closed)
         layout = _layout(first, video, actions, states)
         if rate is None and layout.rate is None:
-            raise DataError(f"{first} does not say how many frames it has per second: give --rate")
+            raise DataError(f"{first} does not state its frame rate: give --rate")
         stated = exact(rate) if rate else cast(Fraction, layout.rate)
         reader = functools.partial(
             StoredEpisodes,
@@ -177,7 +177,7 @@ def _layout(path: Path, video: str | None, actions: str | None, states: str | No
         known = layout_of(file)
     if known is None and (video is None or actions is None):
         raise DataError(
-            f"{path} is in no layout that is known: give --video and --actions, the paths of "
+            f"{path} is in no known layout: give --video and --actions, the paths of "
             "frames and actions in the group of an episode"
         )
     custom = ArrayLayout("its owner", _paths(video), (actions or "").strip("/"), _paths(states))
@@ -265,7 +265,7 @@ def _bounds(group: Any, layout: ArrayLayout, *, alone: bool) -> Bounds | None:
     bounds = bounds_in(group, count, alone=alone)
     for where in (*layout.cameras.values(), *layout.states.values()) if bounds else ():
         if (other := len(array(group, where))) != count:
-            raise DataError(f"{where} has {other} rows, and the actions have {count}")
+            raise DataError(f"{where} has {other} rows, but the actions have {count}")
     return bounds
 
 

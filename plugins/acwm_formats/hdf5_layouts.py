@@ -52,7 +52,7 @@ def open_hdf5(path: Path) -> Any:
     file.visititems_links(lambda name, link: _external(name, link, outside))
     if outside:
         file.close()
-        raise DataError(f"{path} has a link to another file, {outside[0]}: copy what it names")
+        raise DataError(f"{path} has a link to another file, {outside[0]}: copy that file into it")
     return file
 
 

@@ -57,7 +57,7 @@ class HDF5Group(ArrayStore):
         stored = array(self.group, name)
         if stored.dtype.kind not in "fiub":
             raise DataError(
-                f"{stored.name} of {stored.file.filename} holds {stored.dtype}, no numbers"
+                f"{stored.name} of {stored.file.filename} holds {stored.dtype}, not numbers"
             )
         values = values_of(stored, slice(start, stop))
         return values[:, None] if values.ndim == 1 else values

@@ -171,7 +171,7 @@ def opened_picture(source: Path | bytes, kinds: tuple[str, ...] = KINDS) -> Gene
     except FileNotFoundError:
         raise DataError(f"there is no {source}") from None
     except UnidentifiedImageError:
-        raise DataError(f"{what} is no picture in {', '.join(kinds)}") from None
+        raise DataError(f"{what} is not a picture in {', '.join(kinds)}") from None
     except _DAMAGED as error:
         raise DataError(f"{what} cannot be read ({error or type(error).__name__})") from error
 
@@ -187,7 +187,7 @@ def check_pixels(what: object, height: int, width: int) -> None:
     """
     if height * width > MOST_PIXELS:
         raise DataError(
-            f"{what} claims {height}×{width} pixels, and {MOST_PIXELS:,} are read at most"
+            f"{what} claims {height}×{width} pixels, but at most {MOST_PIXELS:,} are read"
         )
 
 

@@ -156,19 +156,23 @@ class Described:
             notes.append("The bounds of actions are those of --bounds.")
         elif self.recorded.actions.bounds is None:
             quantile = self.options.bounds == "quantile"
-            which = "the range but for a hundredth at either end" if quantile else "the range"
+            which = "the range without a hundredth at either end" if quantile else "the range"
             notes.append(f"The bounds of actions are {which} of the training episodes.")
             if not quantile and "train" in rows:
                 notes += outliers(rows["train"], action.names)
         for split, some in rows.items():
             notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
         if self.recorded.instances and not self.reading.instances:
-            notes.append("Masks and contacts were left out, as they are of frames of another size.")
+            notes.append(
+                "Masks and contacts were omitted, because they belong to frames of another size."
+            )
         if alignment.shift:
             unit = "frame" if abs(alignment.shift) == 1 else "frames"
             notes.append(f"Actions were moved by {alignment.shift} {unit}.")
         told = _told([(each.name, note) for each in kept for note in each.notes])
-        told += [f"{defect}: its sound parts were kept" for each in kept for defect in each.defects]
+        told += [
+            f"{defect}: its usable parts were kept" for each in kept for defect in each.defects
+        ]
         others = [name for name in self.cameras if name not in self.reading.cameras]
         if others:
             notes.append(f"Frames of {self.reading.cameras[0]}; other cameras: {', '.join(others)}")

@@ -75,7 +75,7 @@ class LeRobot(Format):
         info = read_info(root)
         features = cast(dict[str, dict[str, Any]], info["features"])
         if not _cameras(features):
-            raise DataError("the dataset has no camera, and a world model predicts video")
+            raise DataError("the dataset has no camera, but a world model predicts video")
         acting = _action_names(features, words(actions))
         places = read_places(root)
         if not places:
@@ -330,12 +330,12 @@ def _action_names(
     if not called:
         others = ", ".join(name for name in numeric if name not in COLUMNS)
         raise DataError(
-            "the dataset has no feature action, and a world model is conditioned on actions: give "
-            f"--actions NAME, one or some of {others}"
+            "the dataset has no feature action, but a world model needs actions: give "
+            f"--actions NAME, one or more of {others}"
         )
     raise DataError(
-        f"the dataset has {', '.join(called)}, and none called action: give --actions with those "
-        "to join, in their order"
+        f"the dataset has {', '.join(called)}, but none called action: give --actions "
+        "with those to join, in order"
     )
 
 
@@ -370,7 +370,7 @@ def _notes(
     if unused:
         yield f"Features that were left out: {', '.join(unused)}."
     if empty:
-        yield f"Features that were left out, as they hold null: {', '.join(empty)}."
+        yield f"Features that were left out because they are null: {', '.join(empty)}."
     yield from text_note(["tasks"]) if any(place.tasks for place in places) else ()
 
 

@@ -120,7 +120,9 @@ def read_places(root: Path) -> list[EpisodeFiles]:
         places = [_place(root, info, filmed, row) for row in rows]
     except (KeyError, TypeError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
-        raise DataError(f"{root / 'meta'} does not say where episodes lie ({reason})") from error
+        raise DataError(
+            f"{root / 'meta'} does not say where its episodes are ({reason})"
+        ) from error
     places.sort(key=lambda place: place.episode)
     for one, other in itertools.pairwise(places):
         if one.episode == other.episode:

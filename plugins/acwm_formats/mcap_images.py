@@ -124,8 +124,9 @@ class LoggedVideo(_Logged):
             for place, frame in enumerate(self._decoded(decoder)):
                 if frame.pts != place:
                     raise self._wrong(
-                        f"message {min(frame.pts, place) + self._first} does not become the next "
-                        "frame: frames are missing, or B-frames are there, which the schema forbids"
+                        f"message {min(frame.pts, place) + self._first} does not decode to "
+                        "the next frame: frames are missing, or there are B-frames, which the "
+                        "schema forbids"
                     )
                 if decoder.color_trc in HDR:
                     raise self._wrong("it has a high dynamic range: convert it to SDR first")

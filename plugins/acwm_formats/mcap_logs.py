@@ -89,7 +89,7 @@ class MCAP(Format):
         root = Path(root)
         files = _files(root)
         if not files:
-            raise DataError(f"{root} is no MCAP file and holds none")
+            raise DataError(f"{root} is not an MCAP file and contains none")
         first = first_sound(files, topics)
         kinds = topics(first)
         filmed = [topic for topic, kind in kinds.items() if is_image(kind) or is_video(kind)]

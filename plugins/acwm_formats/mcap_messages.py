@@ -160,8 +160,8 @@ class Column:
         self.names = self.names or tuple(found)
         if tuple(found) != self.names:
             raise DataError(
-                f"message {len(self.rows)} of {self.name} holds {len(found)} numbers, the first "
-                f"{len(self.names)}"
+                f"message {len(self.rows)} of {self.name} holds {len(found)} numbers, but "
+                f"the first {len(self.names)}"
             )
         self.times.append(entry.time)
         self.stamps.append(stamp_of(content))

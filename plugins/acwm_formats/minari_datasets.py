@@ -38,8 +38,8 @@ from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRe
 METADATA = "metadata.json"
 OWN = "minari_version"
 SAME_COUNT = (
-    "it has as many observations as steps, so its last action leads to no frame, unless each "
-    "observation is the one after its action: then --shift -1 is right"
+    "it has as many observations as steps, so its last action leads to no "
+    "frame; if each observation follows its action, give --shift -1"
 )
 MAIN = "main_data.hdf5"
 
@@ -88,7 +88,7 @@ class Minari(Format):
             )
         said = exact(rate) if rate else _rate(metadata)
         if said is None:
-            raise DataError(f"{root} does not say how many frames it has per second: give --rate")
+            raise DataError(f"{root} does not state its frame rate: give --rate")
         names = tuple(cameras) if video is None else (video,)
         recordings = MinariRecordings(root, names, said, pair(pixel_range), channels)
         return RecordedDataset(
@@ -242,7 +242,7 @@ def _described(root: Path, _: str) -> _Stored:
     """
     metadata, data = _metadata(root), _data(root)
     if not {"observation_space", "action_space"} <= set(metadata):
-        raise DataError(f"{root} does not say its spaces: write it again with a recent Minari")
+        raise DataError(f"{root} does not state its spaces: write it again with a recent Minari")
     kind = metadata.get("data_format", "hdf5")
     if kind not in ("hdf5", "arrow", "parquet"):
         raise DataError(f"{root} stores its arrays as {kind!r:.40}, not as hdf5, arrow or parquet")
@@ -322,7 +322,7 @@ def _rate(metadata: Mapping[str, Any]) -> Fraction | None:
 def _action(space: Any) -> ActionFacts:
     wide = space.n if isinstance(space, Discrete) else math.prod(space.shape or ())
     if wide > MOST_COLUMNS:
-        raise DataError(f"its actions are {wide:,} numbers, and {MOST_COLUMNS:,} are read at most")
+        raise DataError(f"its actions are {wide:,} numbers, but at most {MOST_COLUMNS:,} are read")
     if isinstance(space, Discrete):
         count, start = int(space.n), int(space.start)
         names = tuple(f"action_{start + place}" for place in range(count))

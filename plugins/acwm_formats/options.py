@@ -22,7 +22,7 @@ def _rate(_: click.Context, __: click.Parameter, value: str | None) -> Fraction 
     except (ValueError, ZeroDivisionError):
         rate = Fraction(0)
     if rate is not None and rate <= 0:
-        raise click.BadParameter(f"{value!r} is no rate: give 10, 29.97 or 30000/1001")
+        raise click.BadParameter(f"{value!r} is not a rate: give 10, 29.97 or 30000/1001")
     return rate
 
 
@@ -83,28 +83,28 @@ OPTIONS = (
         "Frame size of a camera, 64 or HEIGHTxWIDTH; by default that of the recordings.",
         type=size,
     ),
-    _option(["--fps"], "Resample to so many frames per second.", metavar="RATE", callback=_rate),
+    _option(["--fps"], "Frames per second to resample to.", metavar="RATE", callback=_rate),
     _option(
         ["--tolerance"],
-        "By how much of a frame interval times may be off.",
+        "Largest error of times, in frame intervals.",
         type=click.FloatRange(0, 1, max_open=True),
         default=0.25,
     ),
     _option(
         ["--max-gap"],
-        "How many missing frames or actions in a row are filled with what was before.",
+        "Longest gap of frames or actions that is filled with the value before.",
         type=click.IntRange(0),
         default=2,
     ),
     _option(
         ["--on-defect"],
-        "What becomes of recordings with defects; trim keeps their sound parts.",
+        "What to do with defective recordings; trim keeps their usable parts.",
         type=click.Choice(["refuse", "skip", "trim"]),
         default="refuse",
     ),
     _option(
         ["--shift"],
-        "By how many frames actions are moved to later ones; negative to earlier ones.",
+        "Move actions this many frames later; negative: earlier.",
         type=int,
         default=0,
     ),
@@ -118,8 +118,8 @@ OPTIONS = (
     _option(
         ["--bounds"],
         "Bounds of actions: the range of the training episodes, the same without outliers "
-        "(quantile), LOW,HIGH of all dimensions or of one after the other, or those of a dataset "
-        "or a run, given by its folder. Actions are cut to them.",
+        "(quantile), LOW,HIGH of all dimensions or of each in turn, or those of a dataset "
+        "or a run, given by its folder. Actions are clipped to them.",
         metavar="range|quantile|LOW,HIGH,…|FOLDER",
         callback=_bounds,
         default="range",
@@ -133,8 +133,8 @@ OPTIONS = (
     _option(["--environment"], "Name of the environment."),
     _option(
         ["--test-episodes"],
-        "How many of the last recordings become ind_test; by default those that the source names, "
-        "or if it names none a tenth, at least five (of fewer than ten recordings two).",
+        "Number of last recordings that become ind_test; by default those that the "
+        "source names, else a tenth, at least five (two of fewer than ten recordings).",
         type=click.IntRange(0),
     ),
 )

@@ -244,7 +244,8 @@ def _rendered(stage: Stage) -> Sequence[Any]:
         reason = f"{type(error).__name__}: {error}"
         if _OPENGL.search(reason):
             raise DataError(
-                "the environment draws by OpenGL, and there is no display: set MUJOCO_GL=egl (with "
+                "the environment draws with OpenGL, but there is no display: set MUJOCO_GL=egl "
+                "(with "
                 "a GPU) or MUJOCO_GL=osmesa, or put xvfb-run before the command"
             ) from error
         raise DataError(f"the environment cannot be rendered ({reason})") from error

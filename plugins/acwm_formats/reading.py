@@ -310,7 +310,7 @@ def common_reading(
 
 def _cameras(first: TimedRecording, options: ImportOptions) -> tuple[str, ...]:
     if not first.cameras:
-        raise DataError("the recordings have no camera, and a world model predicts video")
+        raise DataError("the recordings have no camera, but a world model predicts video")
     for name in options.cameras:
         if name not in first.cameras:
             raise DataError(f"there is no camera {name!r}{suggest(name, first.cameras)}")

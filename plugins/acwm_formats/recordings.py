@@ -162,9 +162,9 @@ class _Import:
         """Print defects as soon as they are known, since decoding may take hours."""
         if defects:
             end = {
-                "refuse": "the others are decoded to find theirs, and kept for the next import",
+                "refuse": "the others are decoded to check them, and kept for the next import",
                 "skip": "these recordings are left out",
-                "trim": "their sound parts are kept",
+                "trim": "their usable parts are kept",
             }[self.options.alignment.on_defect]
             lines = "\n".join(f"  {line}" for line in few([*map(str, defects)]))
             print(f"found without decoding ({end}):\n{lines}", file=sys.stderr, flush=True)
@@ -196,7 +196,7 @@ class _Import:
         stated = stated_rates(self.recorded, self.first)
         rate = common_rate(measured, stated) or next(iter(stated), None)
         if rate is None:
-            raise DataError("the recordings do not tell their rate: give --fps")
+            raise DataError("the recordings do not state their frame rate: give --fps")
         return plain_rate(rate)
 
     def _of_another_rate(self, scan: Scan, fps: float) -> list[Defect]:

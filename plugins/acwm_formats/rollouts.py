@@ -116,9 +116,9 @@ def rollouts(
         if count
     }
     if not recordings:
-        raise RecipeError("there are no episodes to make: every split has 0")
+        raise RecipeError("no episodes were requested: every split has 0")
     fps = stage.metadata.get("render_fps")
-    notes = () if fps else (f"The environment has no render_fps; {FPS} are assumed.",)
+    notes = () if fps else (f"The environment has no render_fps; {FPS} is assumed.",)
     acts = policy if isinstance(policy, str) else getattr(policy, "__name__", "of its owner")
     title = env.env_id if isinstance(env, Named) else name
     return RecordedDataset(

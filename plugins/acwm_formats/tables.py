@@ -94,7 +94,7 @@ def _counts(column: NDArray[Any]) -> bool:
 def _check_width(count: int) -> None:
     if count > MOST_COLUMNS:
         raise ValueError(
-            f"it has {count:,} columns, and {MOST_COLUMNS:,} are read at most: a row is a moment"
+            f"it has {count:,} columns, but at most {MOST_COLUMNS:,} are read: a row is a moment"
         )
 
 
@@ -352,7 +352,7 @@ def _records(value: Any) -> dict[str, Any]:
     names = list(cast(dict[str, Any], rows[0]))
     for place, row in enumerate(rows):
         if not isinstance(row, dict) or [*cast(dict[str, Any], row)] != names:
-            raise ValueError(f"row {place} (counted from 0) has other columns than the first")
+            raise ValueError(f"row {place} (counted from 0) has different columns from the first")
     return {name: np.array([_nan(row[name]) for row in rows]) for name in names}
 
 

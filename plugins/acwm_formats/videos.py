@@ -221,7 +221,7 @@ class VideoFolder:
         if self.table is None and place.tables:
             several = ", ".join(place.tables)
             raise DataError(
-                f"{place.name} has several tables ({several}): keep one, or name it by --actions"
+                f"{place.name} has several tables ({several}): keep one, or name it with --actions"
             )
         if path is None:
             raise DataError(f"there is no table of actions beside {place.name}")
@@ -231,13 +231,13 @@ class VideoFolder:
             return _rows_of(rows, column, index, place, self.count, path), path
         if column and (known := len({*rows[column].tolist()})) > 1:
             raise DataError(
-                f"the column {column} of {path} tells {known} episodes apart, and {place.name} is "
-                "one: record a video for each"
+                f"the column {column} of {path} numbers {known} episodes, but {place.name} "
+                "is one: record a video for each"
             )
         if self.table and place.rows:
             start, stop, count = place.rows
             if (found := len(next(iter(rows.values())))) != count:
-                raise DataError(f"{path} has {found} rows, and its episodes have {count} pictures")
+                raise DataError(f"{path} has {found} rows, but its episodes have {count} pictures")
             rows = {name: values[start:stop] for name, values in rows.items()}
         return rows, path
 
@@ -413,7 +413,7 @@ def _rows_of(
         if not np.array_equal(known, np.arange(count)):
             raise DataError(
                 f"the column {column} of {path} numbers {len(known)} episodes from {known[0]:g} to "
-                f"{known[-1]:g}, and there are {count} videos: number them from 0, or use "
+                f"{known[-1]:g}, but there are {count} videos: number them from 0, or use "
                 "names"
             )
         chosen = values == index
@@ -478,7 +478,9 @@ def _notes(
     if places[0].begins:
         notes.append(f"Pictures are {len(places)} episodes, by the first number in their names.")
     if chosen.time is None and chosen.frame is None:
-        notes.append("Rows belong to frames by their place: the tables have no column of times.")
+        notes.append(
+            "Rows belong to frames by their number, because the tables have no column of times."
+        )
     used = {place.table for place in places} | {path}
     if lone := [table.name for table in files_in(root, READERS) if table not in used]:
         notes.append(f"Tables without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")

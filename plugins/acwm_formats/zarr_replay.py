@@ -111,7 +111,7 @@ class ZarrReplay(Format):
         found = {name: buffer.array(f"data/{name}") for name in names}
         for name, array in found.items():
             if array.shape[0] != buffer.ends[-1]:
-                rows = f"{array.shape[0]} rows, and the last episode ends at {buffer.ends[-1]}"
+                rows = f"{array.shape[0]} rows, but the last episode ends at {buffer.ends[-1]}"
                 raise DataError(f"data/{name} of {root} has {rows}")
         cameras = _chosen(buffer, video, found, [n for n in found if _shows(found[n])])
         action = _chosen(buffer, actions, found, [name for name in ACTIONS if name in found])[:1]

@@ -180,7 +180,8 @@ def _unavailable(evaluator: Evaluator, environment: Environment) -> dict[str, st
     if not environment.can_be_perturbed:
         return dict.fromkeys((PERTURBED, ENSEMBLE), f"{name} has no perturbed start")
     if estimator is None or not estimator.physics.positions:
-        return {ENSEMBLE: f"nothing says what a pixel of {name} resolves: no positions are read"}
+        why = f"the resolution of a pixel in {name} is unknown, because no positions are read"
+        return {ENSEMBLE: why}
     return {}
 
 

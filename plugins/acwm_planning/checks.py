@@ -42,12 +42,12 @@ class PlannerChecks(Suite):
         expect_equal("actions are", plan.actions.ndim, 2)
         expect_equal("an action has", plan.actions.shape[1], len(LOW))
         expect(1 <= count <= len(plan.actions), f"it takes {count} of {len(plan.actions)} actions")
-        expect(plan.evaluations > 0, "it says that it asked for no cost")
+        expect(plan.evaluations > 0, "it reports that it evaluated no cost")
 
     def actions_lie_within_their_bounds(self) -> None:
         """Keep every action finite and within the bounds."""
         actions = self._plan().actions
-        expect(((actions >= LOW) & (actions <= HIGH)).all(), "an action lies out of its bounds")
+        expect(((actions >= LOW) & (actions <= HIGH)).all(), "an action is outside its bounds")
 
     def plans_cost_less_than_chance(self) -> None:
         """Find a plan of lower cost than three quarters of random plans."""

@@ -61,7 +61,7 @@ class Gradient(SearchPlanner):
                 if not costs.requires_grad:
                     raise RecipeError(
                         "planner=gradient needs a cost that is differentiable through this model, "
-                        "and this one is not: use cost=latent, or planner=icem"
+                        "but this one is not: use cost=latent, or planner=icem"
                     )
                 adam.zero_grad()
                 torch.where(costs.isfinite(), costs, 0.0).sum().backward()

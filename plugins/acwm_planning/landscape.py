@@ -58,7 +58,7 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
         RecipeError: the environment has a single action.
     """
     if player.card.action.size < 2:
-        raise RecipeError(f"{player.card.name} has one action, and a landscape is one of two")
+        raise RecipeError(f"{player.card.name} has one action, but a landscape needs two")
     history, true, still = _solved_so_far(player, seed)
     spec, environment = player.card.action, player.environment
     candidates, chosen, values = _candidates(true, spec)

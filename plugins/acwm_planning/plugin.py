@@ -9,7 +9,7 @@ def register_kinds(registry: Registry) -> None:
     registry.add(
         "planner",
         "acwm_planning.planner:Planner",
-        summary="finds the actions that cost least",
+        summary="finds the cheapest actions",
         check="acwm_planning.checks:check_planner",
     )
     registry.add(
@@ -64,5 +64,5 @@ def register_costs(registry: Registry) -> None:
     registry.add(
         "callable",
         "acwm_planning.costs:UserCost",
-        summary="a function of yours: cost.function=module:name",
+        summary="your own function: cost.function=module:name",
     )

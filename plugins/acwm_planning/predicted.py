@@ -31,7 +31,7 @@ class PredictedStates(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self._fields:
             raise NotPredicted(
-                f"the model predicts {', '.join(self._fields)}, and the task looks at {name}: set "
+                f"the model predicts {', '.join(self._fields)}, but the task needs {name}: set "
                 "cost.read=pictures"
             )
         return self._fields[name]
@@ -53,9 +53,7 @@ class _NoMasks:
         return self._frames
 
     def _refuse(self, *_: object) -> Any:
-        raise NotPredicted(
-            "the task looks at masks, which no model predicts: set cost.read=pictures"
-        )
+        raise NotPredicted("the task needs masks, which no model predicts: set cost.read=pictures")
 
     __getattr__ = __getitem__ = __iter__ = __array__ = __eq__ = __hash__ = _refuse
 

@@ -45,7 +45,9 @@ def script(
         if bounded:
             check_bounds(owner, method, action, low, high)
         elif not np.isfinite(action).all():
-            raise PluginError(f"{type(owner).__name__}.{method} gives numbers not finite")
+            raise PluginError(
+                f"{type(owner).__name__}.{method} returns numbers that are not finite"
+            )
         return action
 
     return act

@@ -54,4 +54,4 @@ def open_socket(port: int | None) -> socket.socket:
             server.close()
         else:
             return server
-    raise RecipeError(f"port {port} is taken: choose another --port, or leave it out")
+    raise RecipeError(f"port {port} is taken: choose another --port, or omit it")

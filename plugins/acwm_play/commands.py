@@ -61,7 +61,7 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
         gone = "the simulator, factors, tasks, errors of states and recording"
         click.echo(f"not available, because {names}: {gone}")
     if folder and worlds[0].data:
-        raise RecipeError(f"--export needs a simulator, and {worlds[0].environment} is recorded")
+        raise RecipeError(f"--export needs a simulator, but {worlds[0].environment} is recorded")
     if folder:
         from acwm_play.export.page import export
 

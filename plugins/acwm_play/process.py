@@ -117,8 +117,8 @@ class SimulatorProcess:
             self._process.join(PATIENCE)
             code = self._process.exitcode
             return PluginError(
-                f"the simulator of {self._name} does not start (exit code {code}): `acwm doctor` "
-                "tries it and shows what it prints"
+                f"the simulator of {self._name} does not start (exit code {code}): run `acwm "
+                "doctor` to see its output"
             )
         return PluginError(f"the simulator of {self._name} has ended: start a new scene")
 

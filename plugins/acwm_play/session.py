@@ -294,7 +294,7 @@ class Session:
         """Start or end a recording, between latent frames."""
         if self._live is not None and self._live.recorded:
             self._keep_recording = False
-            text = "Not saved: there is no simulator, only a recording, beside the model"
+            text = "Not saved: the model has a recording beside it, not a simulator"
             self._tell("notice", text=text, wrong=True)
             self._tell_state()
         elif self._keep_recording and self._recording is None and self._last is not None:

@@ -33,7 +33,7 @@ def entry_facts(name: str, summary: Summary, entry: Entry) -> list[tuple[str, st
     counts = {"parameters": size, **{n: facts[n] for n in STEPS if not summary.handed_in}}
     for what, count in counts.items():
         if count is not None and not 0 <= count <= MOST_PARAMETERS:
-            raise ValueError(f"{what} {count} is no possible number")
+            raise ValueError(f"{what} {count} is not a possible number")
     told = {
         "Model": "" if summary.handed_in else " · ".join(summary.parts[kind] for kind in kinds),
         "Size": "" if size is None else f"{size / 1e6:.3g} M parameters",

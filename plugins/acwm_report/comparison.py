@@ -202,10 +202,11 @@ def _comparability(
             hashes = f"{split} {ours[split][:8]}, {theirs[split][:8]}"
             if not _equal_but_for_rounding(summaries, results, label, other, split):
                 raise DataError(
-                    f"{both} on other test data ({hashes}): evaluate both with the same --data"
+                    f"{both} on different test data ({hashes}): evaluate both with the same --data"
                 )
             warnings.append(
-                f"the test data of {label} and {other} were simulated on other kinds of machines "
+                f"the test data of {label} and {other} were simulated on different kinds of "
+                "machines "
                 f"({hashes}); still pictures of both have the same scores, so they are compared"
             )
     for what, fact in _SHOULD_AGREE:
@@ -257,10 +258,10 @@ def _mode(summary: Summary) -> str | None:
 
 
 _MUST_AGREE: tuple[tuple[str, Callable[[Summary], str], str], ...] = (
-    ("on other environments", lambda s: s.parts["env"], "their clips cannot be compared"),
-    ("by other protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
+    ("on different environments", lambda s: s.parts["env"], "their clips cannot be compared"),
+    ("by different protocols", lambda s: s.protocol, "evaluate both with the same --protocol"),
     (
-        "from other numbers of given frames",
+        "from different numbers of given frames",
         lambda s: str(given_frames(s)),
         "evaluate both with the same evaluation.context_frames",
     ),

@@ -47,7 +47,7 @@ class Entry:
             if len(text) > most or not text.replace("\n", " ").isprintable():
                 raise ValueError(f"{name} has more than {most} letters, or some that are not shown")
         if self.parameters is not None and not 0 <= self.parameters <= MOST_PARAMETERS:
-            raise ValueError(f"parameters: {self.parameters} is no number of trained parameters")
+            raise ValueError(f"parameters: {self.parameters} is not a number of trained parameters")
         if self.url and not self.url.startswith(("https://", "http://")):
             raise ValueError(f"the url {self.url!r} does not begin with https://")
 
@@ -75,7 +75,7 @@ def read_entry(folder: Path) -> Entry:
         return typed({"name": _name_of(folder), **values}, Entry)
     except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
         why = " ".join(str(error).split())[:300]
-        raise DataError(f"{path} is no card of an entry ({why})") from error
+        raise DataError(f"{path} is not the card of an entry ({why})") from error
 
 
 def entry_of(run: Path, summary: Summary) -> Entry:

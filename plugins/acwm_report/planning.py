@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 )
 @click.option("--row", "rows", multiple=True, metavar="ROW", help="Only this row of --compare.")
 @click.option(
-    "--preset", default="default", help="Settings that OVERRIDES change: stable_worldmodel."
+    "--preset",
+    default="default",
+    help="Preset settings, which OVERRIDES change: stable_worldmodel.",
 )
 @click.option("--videos", default=3, help="Number of episodes to write videos of.")
 @click.option(
@@ -72,13 +74,15 @@ def plan(
     effective = list(words_of(settings.to_dict()))
     click.echo(f"settings: {' '.join(effective)}")
     if other := [word for word in declared if word not in effective]:
-        click.echo(f"not as the task declares: {' '.join(other)}")
+        click.echo(f"different from the task's: {' '.join(other)}")
     where = out or run / "planning" / task
     if landscape:
         draw_landscapes(run, task, settings, seeds, where, device)
         return
     if compare and settings.differentiates and not rows:
-        click.echo("no row of the simulator: planner=gradient needs gradients, and it has none")
+        click.echo(
+            "no row of the simulator: planner=gradient needs gradients, which it does not have"
+        )
         rows = tuple(row for row in ROW_NAMES if row not in ("simulator", "codec"))
     chosen = settings.rows(rows or (ROW_NAMES if compare else ("model",)))
 
@@ -145,8 +149,9 @@ def draw_landscapes(
     multiple=True,
     default=("scripted",),
     metavar="POLICY",
-    help="Policy to rank; repeat for several. scripted (the default) is all built-in ones; or give "
-    "one of them, such as solution,skill=0.7,noise=0.3,bias=0.15, or module:name for your own.",
+    help="Policy to rank; repeat for several. scripted (the default) stands for all built-in ones; "
+    "or name one of them, such as solution,skill=0.7,noise=0.3,bias=0.15, or module:name for "
+    "your own.",
 )
 @click.option("--seeds", default="0..7", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/ranking/TASK by default.")

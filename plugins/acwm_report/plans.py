@@ -25,7 +25,7 @@ ROWS = {
     "simulator": ("Planning with the simulator", "same planner and cost: upper bound"),
     "codec": ("Simulator through the codec", "states read from reconstructions"),
     "solution": ("Scripted solution", "uses the simulator’s state"),
-    "policy": ("Behaviour policy", "made the data; knows no goal"),
+    "policy": ("Behaviour policy", "collected the data; knows no goal"),
     "random": ("Random actions", "each as long as a block"),
     "still": ("No motion", ""),
 }

@@ -11,8 +11,8 @@ from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import PLAIN, Cell, Column, Row, Table
 
 JUDGES = {
-    "model": ("Model", "what an estimator reads in its predictions"),
-    "estimator": ("Estimator alone", "what it reads in the true pictures: the ceiling"),
+    "model": ("Model", "an estimator's readings of its predictions"),
+    "estimator": ("Estimator alone", "its readings of the true pictures: the upper bound"),
 }
 """Title and explanation of each judge that scores policies."""
 

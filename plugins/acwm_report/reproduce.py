@@ -94,7 +94,7 @@ def _made(data: dict[str, Any]) -> str:
     """The command that made data, or a comment if no command did."""
     if data["command"].startswith("acwm "):
         return data["command"]
-    return f"# {data['path']} was written by a program of its own: bring it along"
+    return f"# {data['path']} was written by another program: copy it there"
 
 
 def _command(card: DatasetCard, path: str) -> str:

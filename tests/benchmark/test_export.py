@@ -141,7 +141,7 @@ def test_what_cannot_be_exported_is_told(tasks, truth, tmp_path):
         export_tasks(["slide"], tasks, data=truth)
     with pytest.raises(DataError, match="holds no dataset of drift"):
         export_tasks(["drift"], tmp_path / "t", data=truth)
-    with pytest.raises(RecipeError, match="no setting of the evaluation"):
+    with pytest.raises(RecipeError, match="not a setting of the evaluation"):
         evaluation_config(["model.width=3"])
     with pytest.raises(RecipeError, match="did you mean 'context_frames'"):
         export_tasks(

@@ -92,9 +92,11 @@ def test_missing_extra_and_double_ones_are_told(given, folder):
     (folder / f"{CLIP}.npz").rename(folder / "slide/ood_test-000009.npz")
     write(folder, "slide/ind_test-000000", GREY, "png")
     said = fault(given, folder)
-    assert "ood_test-000009.npz is of no task" in said
+    assert "ood_test-000009.npz belongs to no task" in said
     assert f"{CLIP}: its prediction is missing" in said
-    assert "slide/ind_test-000000: ind_test-000000 and ind_test-000000.npz are both of it" in said
+    assert (
+        "slide/ind_test-000000: ind_test-000000 and ind_test-000000.npz both belong to it" in said
+    )
     assert "holds no predictions of slide" in fault(given, folder / "slide")
 
 

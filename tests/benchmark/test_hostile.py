@@ -248,7 +248,7 @@ def test_cards_that_are_refused(name, folder, tasks):
     np.savez(folder / f"{CLIP}.npz", video=GREY)
     card = CARDS[name]
     (folder / "entry.yaml").write_bytes(card if isinstance(card, bytes) else card.encode())
-    assert "entry.yaml is no card of an entry" in sentence("score", folder, "--tasks", tasks)
+    assert "entry.yaml is not the card of an entry" in sentence("score", folder, "--tasks", tasks)
 
 
 @pytest.mark.parametrize("make", [*KINDS[:-1], lambda path, _: path.mkdir()])

@@ -49,7 +49,7 @@ class NominalOutside(Disc):
     card = replace(Disc.card, factors=(replace(GAIN, nominal=3.0), SHADE))
 
 
-@FLAWS.caught_by("factors have ranges", "no factor of the card")
+@FLAWS.caught_by("factors have ranges", "not a factor of the card")
 class ShiftsNothing(Disc):
     card = replace(Disc.card, ood_shifts=("gian",))
 
@@ -171,7 +171,7 @@ class Invisible(Disc):
         return np.full_like(frame, 200 if self.shade == "light" else 60), mask
 
 
-@FLAWS.caught_by("actions matter", "very same video")
+@FLAWS.caught_by("actions matter", "same video")
 class Deaf(Disc):
     def _advance(self, action):
         super()._advance(np.full(2, 0.3))
@@ -183,7 +183,7 @@ class RestlessAction(Disc):
         return np.full(2, 1.5, np.float32)
 
 
-@FLAWS.caught_by("perturbed start is close", "the same way twice")
+@FLAWS.caught_by("perturbed start is close", "gives different starts")
 class PerturbedAtRandom(Disc):
     def _perturb(self, amount, rng):
         super()._perturb(amount, np.random.default_rng())
@@ -282,7 +282,7 @@ class ForgetsTheMoment(Disc):
         return lambda: self.position.__setitem__(slice(None), position + 1e-3)
 
 
-@FLAWS.caught_by("card is complete", "comes twice")
+@FLAWS.caught_by("card is complete", "occurs twice")
 class TwinFactors(Disc):
     card = replace(
         Disc.card,
@@ -290,7 +290,7 @@ class TwinFactors(Disc):
     )
 
 
-@FLAWS.caught_by("symmetries hold", "no group: turned180")
+@FLAWS.caught_by("symmetries hold", "form a group: turned180")
 class HalfAGroup(Disc):
     card = replace(Disc.card, symmetries=Disc.card.symmetries[:2])
 

@@ -122,14 +122,14 @@ class Counts(Identity):
         return super()._encode(video)
 
 
-@FLAWS.caught_by("encoding repeats and leaves no trace", "a second time")
+@FLAWS.caught_by("encoding repeats and leaves no trace", "the same clip again")
 class Samples(Identity):
     def _encode(self, video):
         latents = super()._encode(video)
         return latents + 1e-4 * torch.randn_like(latents)
 
 
-@FLAWS.caught_by("encoding repeats and leaves no trace", "changes the video")
+@FLAWS.caught_by("encoding repeats and leaves no trace", "changes its input")
 class InPlace(Identity):
     def _encode(self, video):
         return super()._encode(video.mul_(255).round_().div_(255))

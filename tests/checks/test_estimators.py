@@ -66,7 +66,7 @@ class Sluggish(Misplaced):
         return np.zeros_like(position) + 0.3
 
 
-@FLAWS.caught_by("shows positions in the frame", "far out of the frame")
+@FLAWS.caught_by("shows positions in the frame", "far outside the frame")
 class WrongScale(DiscEstimator):
     def pixels(self, field, values):
         return 10 * super().pixels(field, values)
@@ -79,7 +79,7 @@ class ReadsAnything(DiscEstimator):
         return DiscEstimator(replace(self.card, frame_size=(height, width))).estimate(video)
 
 
-@FLAWS.caught_by("reading repeats and leaves no trace", "changes the video")
+@FLAWS.caught_by("reading repeats and leaves no trace", "changes its input")
 class InPlace(DiscEstimator):
     def estimate(self, video):
         seen = super().estimate(video)

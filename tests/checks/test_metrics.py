@@ -82,7 +82,7 @@ class Saturates(Distance):
         return error if error < 0.1 else 0.1 + 0.01 / error
 
 
-@FLAWS.caught_by("scoring repeats and leaves no trace", "changes the video")
+@FLAWS.caught_by("scoring repeats and leaves no trace", "changes its input")
 class InPlace(Distance):
     def per_frame(self, prediction):
         prediction.video.mul_(0.999)

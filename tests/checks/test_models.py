@@ -320,7 +320,7 @@ class NamesThemTwice(Recurrent):
         return super().matrices() * 2
 
 
-@FLAWS.caught_by("names its own matrices", "no parameter of the model")
+@FLAWS.caught_by("names its own matrices", "not a parameter of the model")
 class NamesCopies(Recurrent):
     def matrices(self):
         return [nn.Parameter(each * 1) for each in super().matrices()]

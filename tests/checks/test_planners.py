@@ -43,7 +43,7 @@ class Greedy(Shooting):
     actions_per_plan = 4
 
 
-@FLAWS.caught_by("actions lie within their bounds", "out of its bounds")
+@FLAWS.caught_by("actions lie within their bounds", "outside its bounds")
 class Unbounded(Shooting):
     def plan(self, cost, low, high, rng):
         plan = super().plan(cost, low, high, rng)

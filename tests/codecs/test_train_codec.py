@@ -165,10 +165,10 @@ def test_a_decoder_learns_from_what_a_model_predicts(run, tmp_path):
         finer.decoder[6].first.weight, CompactReference().decoder[6].first.weight
     )
     for words, says in (
-        (["--freeze-coarse"], "goes with --codec compact_reference"),
+        (["--freeze-coarse"], "needs --codec compact_reference"),
         (["--freeze-coarse", *from_own], "only the coarse layers that ship"),
         (["--codec", "fine", "--predicted-by", "push_cube"], "the latents of another codec"),
-        ([*from_models, "push_sand"], "push_sand at 64×112, of which there are no data"),
+        ([*from_models, "push_sand"], "push_sand at 64×112, of which no data was given"),
         (["--predicted-by", "push_cube", "--start", "random"], "not --start random"),
         (["--codec", "compact", "--start", "fine"], "do not fit into compact"),
     ):

@@ -120,4 +120,4 @@ def test_an_episode_that_the_simulator_did_not_make_fails_its_replay(data):
         return info, content
 
     forge(data, change)
-    assert "it differs in" in problems(data)["replay of train 0"]
+    assert "the episode differs in" in problems(data)["replay of train 0"]

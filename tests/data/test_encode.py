@@ -142,7 +142,10 @@ def test_the_command_encodes_once(many_shards):
         (["--codec", "compact", "codec.wights=1"], "no parameter 'wights'"),
         (["--codec", "compact", "weights=random"], "write codec.NAME=VALUE"),
         (["--codec", "compact", "--split", "tran"], "no split 'tran', only train"),
-        (["--codec", "compact", "--device", "nowhere"], "--device nowhere: there is no such"),
+        (
+            ["--codec", "compact", "--device", "nowhere"],
+            "--device nowhere: this machine has no such",
+        ),
     ],
 )
 def test_mistakes_are_one_sentence(many_shards, words, sentence):

@@ -225,7 +225,7 @@ def test_impossible_requests_are_refused_before_anything_is_made(tmp_path):
         ({"factors": {"colour": "blue"}}, "colour=blue is not possible"),
         ({"episodes": {"test": 1}}, "unknown split 'test'"),
         ({"episodes": {"train": -1}}, "-1 episodes of train"),
-        ({"episodes": {"train": 0}}, "no episodes to make"),
+        ({"episodes": {"train": 0}}, "no episodes were requested"),
         ({"workers": -2}, "workers cannot be -2"),
         ({"shard_episodes": 0}, "shard_episodes"),
     ):

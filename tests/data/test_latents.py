@@ -169,5 +169,5 @@ def test_latents_of_data_that_cannot_be_written_to_are_kept_in_the_cache(
     kept = LatentClipDataset(data, Blocks().fingerprint(), frames=9)[3]["latents"]
     torch.testing.assert_close(kept, beside, rtol=0, atol=0)
     monkeypatch.setenv("ACWM_CACHE", str(data.path / "card.yaml" / "cache"))
-    with pytest.raises(DataError, match=r"train without by data\.cache_latents=false"):
+    with pytest.raises(DataError, match=r"train without them, with data\.cache_latents=false"):
         encode_windows(data, Blocks(gain=2.0), frames=9, progress=False)

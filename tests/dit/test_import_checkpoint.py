@@ -169,7 +169,7 @@ def test_training_does_not_write_over_imported_weights(latest, wan, data, tmp_pa
     before = (made.run / "model.safetensors").read_bytes()
     for resume in (None, "auto", made.run):
         with pytest.raises(
-            TrainingError, match=r"holds weights and no checkpoint.*training\.init_from="
+            TrainingError, match=r"holds weights but no checkpoint.*training\.init_from="
         ):
             fit(made.recipe, made.run, resume=resume)
     assert (made.run / "model.safetensors").read_bytes() == before

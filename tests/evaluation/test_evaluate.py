@@ -217,7 +217,7 @@ def test_it_is_told_when_the_training_is_not_at_its_end(data, tmp_path):
         (["evaluation.step=3"], RecipeError, "did you mean 'steps'"),
         (["evaluation.metrics=[pnsr]"], RecipeError, "did you mean 'psnr'"),
         (["evaluation.metrics=[]"], RecipeError, "must name at least one: let the recipe extend b"),
-        (["model.width=8"], RecipeError, "is no setting of the evaluation"),
+        (["model.width=8"], RecipeError, "is not a setting of the evaluation"),
         (["evaluation.device=tpu9"], RecipeError, "no such device"),
     ],
 )

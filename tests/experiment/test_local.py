@@ -62,8 +62,8 @@ def test_what_needs_a_failure_is_left_out_and_others_go_on(runner):
     ]
     assert made.run(steps) == {
         "bad": "no such thing",
-        "after": "left out, as it needs bad",
-        "later": "left out, as it needs after",
+        "after": "skipped, because it needs bad",
+        "later": "skipped, because it needs after",
         "killed": "ended by SIGKILL; the last line of its log: none",
         "hollow": "ended without leaving a result; the last line of its log: nothing to see",
     }

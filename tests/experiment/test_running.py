@@ -121,7 +121,7 @@ def test_a_failed_run_is_told_and_tried_again(acwm, whole, tmp_path):
     assert lines[1].startswith(f"failed: {name}: ")
     assert "not finite" in lines[1]
     assert lines[1].endswith(f"(see experiments/widths/logs/{name}.log)")
-    assert lines[2] == f"failed: evaluate{name[5:]}: left out, as it needs {name}"
+    assert lines[2] == f"failed: evaluate{name[5:]}: skipped, because it needs {name}"
     assert (made / "report.html").exists()
     written = (made / "report.html").stat().st_mtime_ns
     code, out, _ = acwm("experiment", "widths.yaml", "--plan", cwd=tmp_path)

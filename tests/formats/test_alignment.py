@@ -138,7 +138,7 @@ def test_a_last_row_may_be_there_or_not():
 def test_times_that_stand_still_or_go_back_are_found():
     times = np.arange(12) / 10
     times[5] = times[4]
-    assert "have the time of the one before" in aligned(recording(times)).defects[0].problem
+    assert "have the time of the frame before" in aligned(recording(times)).defects[0].problem
     times[5] = 0.05
     assert "goes back from 0.4 to 0.05" in aligned(recording(times)).defects[0].problem
 

@@ -134,7 +134,7 @@ def test_hdf5_of_another_size_or_cut_has_the_labels_that_fit(simulated, tmp_path
     recorded = HDF5().read(export(simulated, tmp_path / "out", HDF5()))
     small = imported(recorded, tmp_path / "small", size=32)
     assert small.environment.instances == ("unlabelled",)
-    assert any("Masks and contacts were left out" in note for note in small.source["notes"])
+    assert any("Masks and contacts were omitted" in note for note in small.source["notes"])
     imported(recorded, tmp_path / "slow", fps=5)
     one, half = (EpisodeDataset(path, "train")[0] for path in (simulated, tmp_path / "slow"))
     np.testing.assert_array_equal(half.video, one.video[::2])

@@ -189,7 +189,7 @@ def test_what_cannot_be_imported_is_one_sentence(tmp_path):
         rollouts(silent, "silent", COUNTS)
     with pytest.raises(DataError, match="workers=0"):
         imported(rollouts(toy_envs.several("NextStep"), "counting", COUNTS), tmp_path / "live", 1)
-    with pytest.raises(RecipeError, match="no episodes to make"):
+    with pytest.raises(RecipeError, match="no episodes were requested"):
         load(DOT, tmp_path / "data", episodes=(0, 0))
     with pytest.raises(RecipeError, match="give a number such as 100, or 100,10"):
         load(DOT, tmp_path / "data", episodes=(1, 2, 3))

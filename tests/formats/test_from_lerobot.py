@@ -107,11 +107,11 @@ def test_frames_shrink_and_the_name_can_be_given(root, tmp_path):
 def test_a_video_that_ends_early_is_told_with_both_numbers(root, tmp_path):
     shortened = np.concatenate([reference_video(e) for e in range(4)])[:-2]
     release.video(root / "videos/observation.images.top/chunk-000/file-000.mp4", shortened)
-    with pytest.raises(DataError, match=r"episode 3: it is said to have 6 frames, and has 4"):
+    with pytest.raises(DataError, match=r"episode 3: it claims 6 frames, but has 4"):
         load(root, tmp_path / "data")
     card = load(root, tmp_path / "skipped", on_defect="skip")
     assert lengths(tmp_path / "skipped") == [9, 7, 8]
-    assert "6 frames, and has 4" in card.source["skipped"][0]
+    assert "6 frames, but has 4" in card.source["skipped"][0]
     load(root, tmp_path / "trimmed", on_defect="trim")
     assert lengths(tmp_path / "trimmed") == [9, 7, 8, 4]
 
@@ -191,8 +191,8 @@ def spoil(path):
         (lambda r: change_info(r, data_path="../../etc/passwd"), "leads out of "),
         (lambda r: change_info(r, video_path="/etc/{video_key}"), "leads out of "),
         (lambda r: change_info(r, data_path="{chunk_index.__class__}"), "cannot be read"),
-        (lambda r: change_info(r, data_path="{secret}"), "does not say where episodes lie"),
-        (lambda r: change_places(r, length=None), "does not say where episodes lie"),
+        (lambda r: change_info(r, data_path="{secret}"), "does not say where its episodes are"),
+        (lambda r: change_places(r, length=None), "does not say where its episodes are"),
         (lambda r: change_places(r, episode_index=[0, 1, 1, 2]), "episode 1 twice"),
         (lambda r: change_places(r, data__file_index=[0, 0, 0, 7]), r"file-007\.parquet cannot"),
         (lambda r: spoil(r / "meta/episodes/chunk-000/file-000.parquet"), "cannot be read"),
@@ -217,7 +217,7 @@ def test_a_damaged_video_and_a_wrong_camera_are_named(root, tmp_path):
     video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
     content = video.read_bytes()
     video.write_bytes(b"text")
-    with pytest.raises(DataError, match=r"file-000\.mp4 is no MP4"):
+    with pytest.raises(DataError, match=r"file-000\.mp4 is not an MP4"):
         load(root, tmp_path / "data")
     video.write_bytes(content)
     assert load(root, tmp_path / "data").splits["train"] == 2

@@ -106,7 +106,7 @@ def test_a_video_that_starts_two_frames_late_keeps_its_frames(tmp_path):
 def test_rows_with_a_gap_stay_with_their_frames(tmp_path):
     rows = [*range(4), *range(6, 12)]
     root = write(tmp_path / "in", range(12), steps(12), rows)
-    with pytest.raises(DataError, match="it is said to have 10 frames, and has 12"):
+    with pytest.raises(DataError, match="it claims 10 frames, but has 12"):
         read(root, tmp_path / "out")
     lines = json.dumps({"episode_index": 0, "length": 12})
     (root / "meta/episodes.jsonl").write_text(lines)

@@ -110,7 +110,7 @@ def test_links_lead_nowhere_else(tmp_path, form, place):
 def test_pipes_and_pointers_are_named(tmp_path, form, place, spoil):
     path, spoilt, options = source(tmp_path, form, place)
     spoil(spoilt)
-    problem = "is no file" if spoil is hostile.pipe else "is a pointer of Git LFS"
+    problem = "is not a file" if spoil is hostile.pipe else "is a pointer of Git LFS"
     assert f"{spoilt.name} {problem}" in refused(
         run(name_of(form), path, tmp_path / "data", options)
     )
@@ -160,7 +160,7 @@ def test_a_picture_is_no_program(tmp_path, monkeypatch):
     spoilt.write_bytes(hostile.POSTSCRIPT)
     monkeypatch.setattr(subprocess, "Popen", None)
     said = refused(run("videos", path, tmp_path / "data", options))
-    assert "frame_1.png is no picture" in said
+    assert "frame_1.png is not a picture" in said
 
 
 @pytest.mark.parametrize("stored", ["hdf5", "arrow", "parquet"])
@@ -184,7 +184,7 @@ def test_a_picture_in_minari_is_no_program(tmp_path, monkeypatch, stored):
         )
     monkeypatch.setattr(subprocess, "Popen", None)
     said = refused(run("minari", path, tmp_path / "out", {"rate": 10}))
-    assert "episode 0: an image is no picture" in said
+    assert "episode 0: an image is not a picture" in said
 
 
 def minari(folder, stored, jpeg=True):

@@ -118,7 +118,7 @@ def test_pictures_of_other_kinds_are_never_opened(tmp_path, monkeypatch, data):
     path = tmp_path / "0.png"
     path.write_bytes(data)
     for source in (data, path):
-        with pytest.raises(DataError, match="no picture in PNG, JPEG, WEBP, BMP, TIFF"):
+        with pytest.raises(DataError, match="not a picture in PNG, JPEG, WEBP, BMP, TIFF"):
             read_image(source)
 
 

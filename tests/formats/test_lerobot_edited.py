@@ -66,7 +66,7 @@ def test_actions_of_another_name(root, tmp_path, name):
 
 def test_actions_in_several_features(root, tmp_path):
     renamed(root, "action.arm", "action.hand")
-    with pytest.raises(DataError, match=r"has action\.arm, action\.hand, and none.*--actions"):
+    with pytest.raises(DataError, match=r"has action\.arm, action\.hand, but none.*--actions"):
         LeRobot().read(root)
     with pytest.raises(DataError, match=r"no numbers 'action\.han'; did you mean 'action\.hand'"):
         LeRobot().read(root, actions="action.arm,action.han")
@@ -86,7 +86,7 @@ def test_what_lies_beside_the_actions_is_named(root):
 
 def test_a_dataset_without_actions_names_the_option(root):
     renamed(root, "command")
-    with pytest.raises(DataError, match=r"give --actions NAME, one or some of .*command"):
+    with pytest.raises(DataError, match=r"give --actions NAME, one or more of .*command"):
         LeRobot().read(root)
     assert LeRobot().read(root, actions="command").actions.names == ("shoulder", "elbow")
 

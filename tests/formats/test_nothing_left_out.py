@@ -200,7 +200,7 @@ def test_choices_and_few_test_episodes_are_remarked(tmp_path):
     said = " | ".join(each.text for each in survey(tmp_path).findings)
     assert "button takes the 4 whole numbers from 0 to 3" in said
     assert "push takes" not in said
-    assert "ind_test has 2 episodes: an interval and a verdict take 5" in said
+    assert "ind_test has 2 episodes: an interval and a verdict need 5" in said
 
 
 def settings(kind):

@@ -73,7 +73,7 @@ def test_lengths_that_disagree_are_listed_and_the_sound_parts_kept_if_asked(fold
     assert load(folder, tmp_path / "data", on_defect="skip").splits["train"] == 1
     card = load(folder, tmp_path / "trimmed", on_defect="trim")
     assert EpisodeDataset(tmp_path / "trimmed", "train").lengths == [9, 7, 9, 12, 12]
-    assert sum("sound parts" in note for note in card.source["notes"]) >= 4
+    assert sum("usable parts" in note for note in card.source["notes"]) >= 4
 
 
 def test_the_aggregate_counts_and_pieces_do_not(folder, tmp_path):

@@ -88,7 +88,7 @@ def test_videos_that_cannot_be_are_refused(folder, tmp_path):
 
 def test_an_episode_of_one_frame_is_named(folder, tmp_path):
     release.rewrite(folder / "ind_train", lambda entries: entries[2].update(length=1))
-    with pytest.raises(DataError, match=r"episode_2\.mp4: it is said to have 1 frames, and has 12"):
+    with pytest.raises(DataError, match=r"episode_2\.mp4: it claims 1 frames, but has 12"):
         load(folder, tmp_path / "data")
 
 

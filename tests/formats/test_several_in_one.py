@@ -211,7 +211,7 @@ def test_pictures_of_several_episodes_in_one_folder(tmp_path, pattern, says, tab
 def test_pictures_whose_rows_are_of_another_number_are_refused(tmp_path):
     pictured(tmp_path / "pixels", NAMES["two numbers"])
     np.savez(tmp_path / "all.npz", action=ROWS[:-1])
-    with pytest.raises(DataError, match="38 rows, and its episodes have 39 pictures"):
+    with pytest.raises(DataError, match="38 rows, but its episodes have 39 pictures"):
         Videos().read(tmp_path, rate=10).splits[0]
 
 

@@ -104,7 +104,7 @@ def test_lengths_that_disagree(tmp_path):
     path, options = arrays.replay(tmp_path, PLAIN)
     ends = zarr.open_array(str(path / "meta/episode_ends"), mode="r+")
     ends[:] = [8, 17, 99]
-    with pytest.raises(DataError, match="27 rows, and the last episode ends at 99"):
+    with pytest.raises(DataError, match="27 rows, but the last episode ends at 99"):
         ZarrReplay().read(path, **options)
 
 
@@ -116,7 +116,7 @@ def test_minari_that_would_make_an_environment_is_refused(tmp_path):
     del metadata["action_space"]
     metadata["env_spec"] = json.dumps({"id": "x", "entry_point": "pytest:fail"})
     file.write_text(json.dumps(metadata))
-    with pytest.raises(DataError, match="does not say its spaces"):
+    with pytest.raises(DataError, match="does not state its spaces"):
         Minari().read(path, **options)
 
 

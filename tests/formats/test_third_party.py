@@ -166,7 +166,7 @@ def test_an_archive_is_to_be_unpacked(tmp_path):
         (["export", "rav", "."], "unknown format 'rav'; did you mean 'raw'?"),
         (["import", "raw", "."], "raw can only be exported, not imported"),
         (["export", "npz", "."], "npz can only be imported, not exported"),
-        (["import", "."], ". is in no format that is known: give --format, one of"),
+        (["import", "."], ". is in no known format: give --format, one of"),
         (["import", ".", "--format", "npx"], "unknown format 'npx'; did you mean 'npz'?"),
         (["import", "npz", ".", "--rates", "5"], "No such option '--rates'"),
         (["import", "npz", ".", "--rate", "x"], "Invalid value for '--rate'"),
@@ -304,12 +304,12 @@ class Strange(Folder):
     [
         (Changing, "a second import differs"),
         (Untyped, "untyped has no type"),
-        (NoTraining, "nothing is there to train on"),
-        (Everything, "an empty folder is said to be in this format"),
-        (Shy, "it does not know its own example"),
+        (NoTraining, "there is nothing to train on"),
+        (Everything, "it recognises an empty folder"),
+        (Shy, "it does not recognise its own example"),
         (Nothing, "nothing is written"),
         (Numbered, "a second export differs"),
-        (Taken, "out is an option of every format: call it otherwise"),
+        (Taken, "out is an option of every format: choose another name"),
     ],
 )
 def test_flaws_are_found(flawed, reason):

@@ -172,7 +172,7 @@ REFUSED = {
     "a number too many": (
         {"a.mp4": None, "all.csv": "episode,push\n0,1\n1,1\n"},
         {},
-        "numbers 2 episodes from 0 to 1, and there are 1 videos",
+        "numbers 2 episodes from 0 to 1, but there are 1 videos",
     ),
 }
 

@@ -115,7 +115,7 @@ def test_frames_can_shrink(tmp_path):
         ({"train": Mine(1)}, {"size": 60}, ShapeError, "multiple of 8"),
         ({"train": Mine(1)}, {"size": 64}, DataError, "cannot be enlarged"),
         ({"train": Mine(1, size=(8, 48))}, {}, DataError, "too small"),
-        ({"train": Mine(1)}, {"fps": 0}, ShapeError, "is no rate"),
+        ({"train": Mine(1)}, {"fps": 0}, ShapeError, "is not a rate"),
     ],
 )
 def test_what_cannot_be_written_is_refused(tmp_path, splits, changes, error, problem):

@@ -111,7 +111,7 @@ def test_states_are_the_model_s_own_where_it_predicts_them(read):
 def test_what_a_model_does_not_predict_is_read_from_pictures():
     pictures = StateDistance(frames=1)(Known(PLACES), tiny.PLACE, GOAL)
     assert StateDistance(frames=1)(Elsewhere(PLACES), tiny.PLACE, GOAL).equal(pictures)
-    with pytest.raises(RecipeError, match="predicts speed, and the task looks at position: set"):
+    with pytest.raises(RecipeError, match="predicts speed, but the task needs position: set"):
         StateDistance(read="model")(Elsewhere(PLACES), tiny.PLACE, GOAL)
     with pytest.raises(RecipeError, match=r"predicts no states: set cost\.read=pictures"):
         StateDistance(read="model")(Known(PLACES), tiny.PLACE, GOAL)
@@ -141,7 +141,7 @@ def test_a_model_that_predicts_states_predicts_no_masks(look):
     """A task that looks at masks gets those of pictures, and no empty ones."""
     seen = predicted_observation(torch.zeros(3, 2), SHAPES)
     assert len(seen.masks) == 3
-    with pytest.raises(RecipeError, match="the task looks at masks"):
+    with pytest.raises(RecipeError, match="the task needs masks"):
         look(seen.masks)
 
 

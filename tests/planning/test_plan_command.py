@@ -130,7 +130,7 @@ def test_the_command_takes_what_a_task_declares(mine, capsys, monkeypatch):
     found = json.loads((mine / "planning/place/settings.json").read_text())
     assert (found["cost"]["name"], found["planner"]["horizon"]) == ("latent", 2)
     assert "planner.horizon=2" in told.splitlines()[0]
-    assert told.splitlines()[1] == "not as the task declares: cost=state"
+    assert told.splitlines()[1] == "different from the task's: cost=state"
 
 
 def solved_at_the_start(*indices):

@@ -200,7 +200,7 @@ def test_what_keeps_the_runtime_away_is_told(cache, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RecipeError, match="npm is needed once"):
         runtime.runtime()
-    with pytest.raises(RecipeError, match="is no folder of onnxruntime-web"):
+    with pytest.raises(RecipeError, match="is not a folder of onnxruntime-web"):
         runtime.runtime(tmp_path)
 
 

@@ -82,7 +82,7 @@ def test_the_person_drives_the_model_and_the_recording_goes_on(pool, tmp_path):
         assert head["alone"] == 0
         np.testing.assert_allclose(true.astype(int), seen, atol=1)
         await page.say("record", on=True)
-        assert "Not saved: there is no simulator" in (await page.told("notice"))["text"]
+        assert "Not saved: the model has a recording" in (await page.told("notice"))["text"]
 
     played(pool, tmp_path, story)
     assert not list(tmp_path.iterdir())

@@ -111,10 +111,12 @@ def test_other_settings_are_named(tmp_path, runs):
 def test_what_cannot_be_paired_is_refused(tmp_path, runs):
     base, rows = runs / "base", synthetic.clips(BASE)
     bad = {
-        "on other environments (drift, reacher)": {"environment": "reacher"},
-        "on other test data (ind_test aaaaaaaa, cccccccc)": {"checksums": {"ind_test": "c" * 64}},
-        "by other protocols (full, acwm-phys)": {"protocol": "acwm-phys"},
-        "from other numbers of given frames (1, 5)": {"given": 5},
+        "on different environments (drift, reacher)": {"environment": "reacher"},
+        "on different test data (ind_test aaaaaaaa, cccccccc)": {
+            "checksums": {"ind_test": "c" * 64}
+        },
+        "by different protocols (full, acwm-phys)": {"protocol": "acwm-phys"},
+        "from different numbers of given frames (1, 5)": {"given": 5},
     }
     for number, (reason, words) in enumerate(bad.items()):
         own = moved(rows, "copy", 0.1) if "checksums" in words else rows
@@ -150,7 +152,7 @@ def test_data_that_another_kind_of_processor_simulated_are_compared(runs, tmp_pa
     words = {"checksums": {"ind_test": "c" * 64}, "weights": "2" * 64}
     like = synthetic.run(tmp_path / "like", moved(rows, "copy", 1e-5), **words)
     found = compare_runs([base, like])
-    (warning,) = [each for each in found.warnings if "other kinds of machines" in each]
+    (warning,) = [each for each in found.warnings if "different kinds of machines" in each]
     assert "ind_test aaaaaaaa, cccccccc" in warning
     assert found.differences
     fewer = synthetic.run(tmp_path / "fewer", moved(rows, "copy", 1e-5)[:-8], **words)
@@ -161,7 +163,7 @@ def test_data_that_another_kind_of_processor_simulated_are_compared(runs, tmp_pa
         "source": {"kind": "lerobot"},
     }.items():
         other = synthetic.run(tmp_path / name, rows, dataset={name: change}, **words)
-        with pytest.raises(DataError, match="on other test data"):
+        with pytest.raises(DataError, match="on different test data"):
             compare_runs([base, other])
 
 

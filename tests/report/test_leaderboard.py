@@ -90,7 +90,7 @@ def test_numbers_that_cannot_be_are_not_shown(facts, tmp_path):
     values = json.loads(path.read_text())
     values["provenance"] |= facts
     path.write_text(json.dumps(values))
-    assert "no possible number" in collect(tmp_path).broken["run/evaluation/summary.json"]
+    assert "not a possible number" in collect(tmp_path).broken["run/evaluation/summary.json"]
 
 
 def test_scores_are_those_of_the_files(folder):

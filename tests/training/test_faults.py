@@ -59,7 +59,7 @@ def test_a_run_folder_that_is_removed_is_one_sentence(data, tmp_path):
         "class_path": "tests.training.faults.Remove",
         "init_args": {"folder": str(tmp_path / "run")},
     }
-    with pytest.raises(TrainingError, match=r"run was removed or moved while it was trained"):
+    with pytest.raises(TrainingError, match=r"run was removed or moved during training"):
         fit(tiny_recipe(data, trainer={"callbacks": [remove]}), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

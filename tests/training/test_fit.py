@@ -297,7 +297,7 @@ def test_there_must_be_something_to_resume(data, tmp_path, monkeypatch):
         load_run(run.path)
     fit(killable(data), "", resume=run.path)  # it starts, as nothing was saved
     shutil.rmtree(run.checkpoints)
-    with pytest.raises(TrainingError, match="holds weights and no checkpoint to resume from"):
+    with pytest.raises(TrainingError, match="holds weights but no checkpoint to resume from"):
         fit(killable(data), "", resume=run.path)
 
 

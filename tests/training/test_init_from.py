@@ -75,7 +75,9 @@ def test_weights_that_fit_are_taken_if_the_others_may_be_new(first, data, tmp_pa
     for name, tensor in state(first).items():
         torch.testing.assert_close(state(same)[name], tensor, rtol=0, atol=1e-7)
     sections["model"] = {"width": 6}
-    with pytest.warns(AcwmWarning, match="initialised randomly, as .* has none that fit") as told:
+    with pytest.warns(
+        AcwmWarning, match="initialised randomly, because .* has none that fit"
+    ) as told:
         other = fit(tiny_recipe(data, trainer={"max_steps": 1}, **sections), tmp_path / "other")
     before, after = state(first), state(other)
     fitting = {name for name in after if before[name].shape == after[name].shape}
@@ -111,7 +113,7 @@ def test_weights_of_other_actions_or_another_rate_are_refused(changed, said, fir
 def test_other_bounds_are_reported(first, data, tmp_path):
     wider = relabelled(data, tmp_path / "data", low=(-8.0, -4.0))
     recipe = tiny_recipe(wider, trainer={"max_steps": 1}, **started_from(first))
-    with pytest.warns(AcwmWarning, match="the bounds of the actions are not those of"):
+    with pytest.warns(AcwmWarning, match="the bounds of the actions differ from those of"):
         fit(recipe, tmp_path / "run")
 
 

@@ -50,7 +50,7 @@ def test_everything_comes_from_the_run(started):
         (["mine.yaml", "data.path=here"], "model.width was 6, is 8; trainer.max_steps was 4, is"),
         (["model.width=7", "trainer.max_steps=9"], "another recipe: model.width was 6, is 7; "),
         (["codec.gain=3.0", "training.seed=1"], "codec.gain was 2.0, is 3.0; training.seed was 0"),
-        (["trainer.max_steps=9", "--out", "other"], "leave out --out other"),
+        (["trainer.max_steps=9", "--out", "other"], "omit --out other"),
         (["data.path=other"], "no dataset other"),
     ],
 )

@@ -69,13 +69,13 @@ def test_ours_make_room_for_the_users():
         ({"gradient_clip_val": 1.0, "gradient_clip_algorithm": "nrom"}, "nrom"),
         (
             {"enable_checkpointing": False},
-            "leaves no model: leave out trainer.enable_checkpointing",
+            "leaves no model: omit trainer.enable_checkpointing",
         ),
         ({"barebones": True}, "leaves no model"),
         ({"max_steps": 0}, "trains nothing"),
         ({"overfit_batches": 1}, "data.fraction"),
-        ({"max_epochs": 3}, "set trainer.max_steps=… in place of trainer.max_epochs"),
-        ({"max_steps": -1}, "nothing says how long to train"),
+        ({"max_epochs": 3}, "set trainer.max_steps=… instead of trainer.max_epochs"),
+        ({"max_steps": -1}, "the length of the training is missing"),
         ({"precision": "bf16-true"}, "use bf16-mixed"),
         ({"precision": "fp8"}, "trainer.precision: expected one of 'transformer-engine'"),
         ({"max_steps": 1e3}, "trainer.max_steps: Expected int. Got value: 1000.0"),
@@ -120,7 +120,7 @@ def test_fsdp_is_a_word():
 def test_a_recipe_for_gpus_on_a_machine_without_says_what_to_do(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(TrainingError, match=r"no GPU here .* by \+small"):
+    with pytest.raises(TrainingError, match=r"no GPU here.* use \+small"):
         build(accelerator="gpu", devices=8)
 
 

@@ -137,13 +137,13 @@ def test_pipes_are_not_waited_for(data, tmp_path, what):
     (data / what).unlink()
     os.mkfifo(data / what)
     said = one_sentence("data", "info", data)
-    assert "is no regular file" in said or "has no card.yaml" in said
+    assert "is not a regular file" in said or "has no card.yaml" in said
     folder = run(tmp_path / "run", clips([20.0, 21.0, 22.0]))
     for file in ("episodes.parquet", "summary.json"):
         (folder / "evaluation" / file).unlink()
         os.mkfifo(folder / "evaluation" / file)
-        assert "is no regular file" in one_sentence("report", folder)
-    assert "no regular file" in one_sentence("leaderboard", folder)
+        assert "is not a regular file" in one_sentence("report", folder)
+    assert "not a regular file" in one_sentence("leaderboard", folder)
 
 
 def test_links_of_others_are_none_of_acwms_business(tmp_path, data, mine):

@@ -113,7 +113,7 @@ def test_links_stay_in_the_folder(tmp_path):
         (root / "one" / link).unlink()
     (root / "one/below").symlink_to(outside)
     os.mkfifo(outside / "pipe")
-    with pytest.raises(DataError, match="pipe is no file"):
+    with pytest.raises(DataError, match="pipe is not a file"):
         check_tree(root, follow_links=True)
 
 
@@ -130,9 +130,9 @@ def test_what_is_no_file_is_named(tmp_path, kind):
     else:
         os.mkfifo(path.with_name("1.png"))
         path.symlink_to("1.png")
-    with pytest.raises(DataError, match=r"\.png is no file"):
+    with pytest.raises(DataError, match=r"\.png is not a file"):
         check_tree(path.parent, follow_links=True)
-    with pytest.raises(DataError, match=r"is no file"):
+    with pytest.raises(DataError, match=r"is not a file"):
         check_tree(path)
 
 

@@ -220,7 +220,7 @@ def test_names_are_no_formulas_in_charts(tmp_path):
 DAMAGES = {
     "no JSON": lambda file: file.write_text("{"),
     "a list": lambda file: file.write_text("[]"),
-    "no splits": lambda file: rewrite(file, lambda v: v.update(splits={})),
+    "not splits": lambda file: rewrite(file, lambda v: v.update(splits={})),
     "no provenance": lambda file: rewrite(file, lambda v: v.update(provenance={})),
     "no model": lambda file: rewrite(
         file, lambda v: v["splits"]["ind_test"]["scores"].update(rows={})

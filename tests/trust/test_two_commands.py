@@ -105,7 +105,7 @@ def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
             folder.mkdir()
             (folder / "file").write_text("theirs")
 
-    with pytest.raises(DataError, match=f"another command has made {folder} meanwhile"):
+    with pytest.raises(DataError, match=f"another command has created {folder} in the meantime"):
         overtaken()
     assert (folder / "file").read_text() == "theirs"
     assert [each.name for each in tmp_path.iterdir()] == ["made"]

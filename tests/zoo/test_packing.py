@@ -215,7 +215,7 @@ def test_results_of_another_version_are_not_mixed_with_its_own(named, run, data,
     shutil.copytree(run, copy)
     done = invoke("evaluate", "drifting", "--data", data)
     assert done.exit_code == 2
-    assert "holds something else than this drifting: move it away" in done.output
+    assert "holds something other than this drifting: move it away" in done.output
 
 
 @pytest.mark.parametrize("command", ["rollout", "evaluate"])
@@ -299,7 +299,7 @@ def test_another_folder_in_the_place_of_the_copy_is_left_alone(named, data, tmp_
     done = invoke("rollout", "drifting", "--data", data)
     assert done.exit_code == 2
     assert done.output == (
-        "acwm: runs/trained/drifting holds something else than this drifting: move it away\n"
+        "acwm: runs/trained/drifting holds something other than this drifting: move it away\n"
     )
     assert files(place) == {"notes.txt"}
 

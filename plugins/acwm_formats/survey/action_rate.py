@@ -71,14 +71,15 @@ class ActionRate:
         told = f"{total} of the sum is read from the frames, {value} of the value"
         if self.follows == "sum":
             return (
-                "the video follows their sum over a frame rather than the value that was taken "
-                f"({told}): velocities or forces? Import again with --action-kind velocity, torque "
-                "or delta, or with absolute if they are targets that are reached late"
+                "the video follows their sum over a frame rather than the value that was "
+                f"used ({told}): are they velocities or forces? Import again with --action-kind "
+                "velocity, torque "
+                "or delta, or with absolute if they are targets that the robot reaches late"
             )
         if self.follows == "value":
             return (
                 f"the video follows their values rather than their sum over a frame ({told}): if "
-                f"they are targets, --action-kind absolute says so; velocities or forces? {ALSO}"
+                f"they are targets, give --action-kind absolute; velocities or forces? {ALSO}"
             )
         return f"velocities or forces? Import again with {ALSO}"
 
@@ -89,7 +90,7 @@ class ActionRate:
         if {*self.kinds} == {"delta"}:
             return "summed over each frame"
         if {*self.kinds} != {"absolute"}:
-            return "held, averaged or summed as their kinds demand"
+            return "held, averaged or summed by kind"
         count = round(1 / max(1 - self.unused, 1e-9))
         if 2 <= count < len(COUNTS):
             return f"held: one of {COUNTS[count]} is used"

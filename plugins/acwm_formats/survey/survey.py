@@ -100,9 +100,9 @@ class Survey:
         if not found.follows:
             return "Nothing in the video follows the actions"
         if self.rate and self.rate.is_open:
-            return "The video follows the actions; when is open until their kind is known"
+            return "The video follows the actions; the delay is unknown until their kind is known"
         if found.delay is None:
-            return "The video follows the actions; when cannot be told"
+            return "The video follows the actions; the delay is unknown"
         if found.confidence < SURE:
             return "The video follows the actions; the delay is uncertain"
         if not found.delay:
@@ -175,11 +175,11 @@ def _of_rate(rate: ActionRate | None) -> Iterator[Finding]:
 def _of_following(found: Survey) -> Iterator[Finding]:
     seen, says = found.following, found.headline
     if seen is None:
-        why = "it takes at least four episodes of a dozen frames, and actions that change"
+        why = "a verdict needs at least four episodes of a dozen frames, and actions that change"
         yield Finding("note", f"{says}: {why}")
     elif not seen.follows:
         why = (
-            f"in {seen.episodes} episodes, frames tell no more of their own actions than others do"
+            f"in {seen.episodes} episodes, frames show no more of their own actions than of others"
         )
         yield Finding("bad", f"{says}: {why}; a model would learn to ignore them")
     elif found.rate and found.rate.is_open:
@@ -188,10 +188,10 @@ def _of_following(found: Survey) -> Iterator[Finding]:
         yield Finding("note", f"{says}: actions change too steadily")
     elif seen.confidence < SURE:
         likely = f"{_frames(seen.delay)} in {seen.confidence:.0%} of resamples"
-        yield Finding("note", f"{says} ({likely}): more episodes would settle it")
+        yield Finding("note", f"{says} ({likely}): more episodes would decide")
     elif seen.delay:
         edge = " (or more: no larger delay was tried)" if abs(seen.delay) == SHIFTS else ""
-        advice = f"import it with --shift {seen.delay} if that is not how the machine is"
+        advice = f"import it with --shift {seen.delay} if your robot has no such offset"
         yield Finding("bad", f"{says}{edge}, confidence {_sure(seen.confidence)}: {advice}")
     else:
         yield Finding("good", f"{says}: delay 0, confidence {_sure(seen.confidence)}")
@@ -200,7 +200,7 @@ def _of_following(found: Survey) -> Iterator[Finding]:
 def _of_actions(found: Survey) -> Iterator[Finding]:
     constant = [each.name for each in found.actions if each.constant]
     if constant:
-        yield Finding("note", f"constant: {', '.join(constant)}; nothing can be learned of them")
+        yield Finding("note", f"constant: {', '.join(constant)}; nothing can be learned from them")
     recorded = bool(found.card.source)  # the bounds of a simulator are not taken from its data
     for each in found.actions:
         if each.narrow is not None and not each.constant:
@@ -214,12 +214,12 @@ def _of_actions(found: Survey) -> Iterator[Finding]:
         if each.choices and recorded:
             text = (
                 f"{each.name} takes the {each.choices} whole numbers from {each.least:g} to "
-                f"{each.most:g}: models read an amount. If they are choices, record a column of 0 "
-                "and 1 for each"
+                f"{each.most:g}: models take them as an amount. If they are choices, record "
+                "a column of 0 and 1 for each"
             )
             yield Finding("note", text)
         if each.outside:
-            yield Finding("note", f"{each.outside:.2%} of {each.name} are out of its bounds")
+            yield Finding("note", f"{each.outside:.2%} of {each.name} are outside its bounds")
 
 
 def _of_frames(found: Survey) -> Iterator[Finding]:
@@ -239,12 +239,12 @@ def _of_frames(found: Survey) -> Iterator[Finding]:
 
 def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
     if not lengths.keys() - {"train"}:
-        yield Finding("note", f"no test episodes: a verdict takes {MIN_EPISODES}")
+        yield Finding("note", f"no test episodes: a verdict needs {MIN_EPISODES}")
     for split, each in lengths.items():
         if split != "train" and len(each) < MIN_EPISODES:
             yield Finding(
                 "note",
-                f"{split} has {len(each)} episodes: an interval and a verdict take {MIN_EPISODES}. "
+                f"{split} has {len(each)} episodes: an interval and a verdict need {MIN_EPISODES}. "
                 f"Record more, or import again with --test-episodes {MIN_EPISODES}",
             )
 

@@ -36,7 +36,9 @@ def runtime(folder: Path | None = None) -> dict[str, bytes]:
         _fetch(dist)
     missing = [name for name in FILES.values() if not (dist / name).is_file()]
     if missing:
-        raise RecipeError(f"{dist.parent} is no folder of {PACKAGE}: it has no dist/{missing[0]}")
+        raise RecipeError(
+            f"{dist.parent} is not a folder of {PACKAGE}: it has no dist/{missing[0]}"
+        )
     return {key: (dist / name).read_bytes() for key, name in FILES.items()}
 
 

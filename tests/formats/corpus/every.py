@@ -122,7 +122,7 @@ TIMES = [
         "two frames at one moment",
         (0, 1, 2, 3, 3, 4, 5, 6),
         **{**TIMED, "clip": TWICE},
-        refused="the time of the one before",
+        refused="the time of the frame before",
     ),
     moments(
         "rows that go back",
@@ -136,7 +136,7 @@ TIMES = [
         (*range(8),),
         (0, 1, 2, 2, 3, 4, 5, 6),
         **{**TIMED, "only": VIDEOS},
-        refused="the time of the one before",
+        refused="the time of the frame before",
     ),
     moments(
         "lost rows",
