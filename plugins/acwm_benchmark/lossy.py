@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from acwm_benchmark.scheduling import scheduling_kept
 from acwm_benchmark.videos import Coding, Wanted, read_video
 from acwm_core.data.pictures import to_pixels
 from acwm_core.data.video import Encoding, encode_frames
@@ -135,7 +136,8 @@ class LossyVideo:
         if name == "libx264" and stored == "gbrp":  # FFmpeg has an encoder of its own for it
             name, stored = "libx264rgb", "rgb24"
         encoding = Encoding("rgb24", stored, name, self.encoder.options(quality))
-        return encode_frames(frames, frames.shape[1:3], encoding, self.fps, KEYFRAMES)
+        with scheduling_kept():
+            return encode_frames(frames, frames.shape[1:3], encoding, self.fps, KEYFRAMES)
 
     def _median_quality(self, samples: Iterable[Sample], encoder: Encoder) -> int:
         if encoder.best == encoder.worst:

@@ -44,11 +44,12 @@ def few(line, learns_motion):
     assert acwm == "acwm"
     if command == "generate":
         place = words.index("--episodes") + 1
-        words[place] = ",".join(str(min(4, int(count))) for count in words[place].split(","))
+        counts = zip((3, 2, 2), words[place].split(","), strict=True)
+        words[place] = ",".join(str(min(most, int(count))) for most, count in counts)
         words += ["--workers", "0"]
     if command == "fit":
         words += QUICK_FIT
-        words += ["training.agent_steps=1"] if learns_motion else []
+        words += ["objective.motion_steps=1"] if learns_motion else []
     if command == "evaluate":
         words += QUICK_EVALUATION
     return command, words
@@ -60,7 +61,7 @@ def test_every_printed_command_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = printed(name)
     recipe = RunFolder(folder(name)).recipe.read_text("utf-8")
-    learns_motion = re.search(r"agent_steps: [1-9]", recipe) is not None
+    learns_motion = re.search(r"motion_steps: [1-9]", recipe) is not None
     commands = [few(line, learns_motion) for line in lines]
     assert [command for command, _ in commands][-3:] == ["fit", "evaluate", "report"]
     for command, words in commands:

@@ -7,6 +7,7 @@ import av
 import numpy as np
 from PIL import Image
 
+from acwm_benchmark.scheduling import scheduling_kept
 from tests.formats.corpus.pictures import SIZE, depth, picture
 
 FAST = {
@@ -58,7 +59,7 @@ def write_clip(path, numbers, times, rate, clip, size=SIZE):
     """Write pictures of `numbers` that are shown at `times` (seconds)."""
     tick = clip.tick or 1 / Fraction(rate)
     options = {"avoid_negative_ts": "disabled"} if clip.shift < 0 else {}
-    with av.open(str(path), "w", options=options) as output:
+    with scheduling_kept(), av.open(str(path), "w", options=options) as output:
         stream = output.add_stream(clip.codec, rate=Fraction(rate))
         first = stored(0, clip, size)
         stream.width, stream.height, stream.pix_fmt = first.width, first.height, clip.pixels
