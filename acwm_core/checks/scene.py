@@ -21,7 +21,7 @@ how far they are spread over the episode."""
 
 AWAY, MOSTLY, EVERY = 0.1, 0.75, 4
 """How far in frame heights a position may appear from the nearest pixel of its instance, and in
-which share of the cases, as others may cover it; every so many-th frame is looked at."""
+which share of the cases, as others may cover it; every n-th frame is examined."""
 
 Array = NDArray[np.float64]
 

@@ -33,9 +33,9 @@ def list_components(kind: str | None) -> None:
     """List the installed components, or the recipes.
 
     Recipes use these names; an estimator has the name of its environment, and a task is
-    ENVIRONMENT.TASK. The kinds and their numbers come first, then each component with its plugin
-    and what it needs that is not installed. KIND lists one kind only, such as environment or
-    codec; recipe lists the recipes that `acwm fit` takes.
+    ENVIRONMENT.TASK. Prints how many components each kind has, then each component with its plugin
+    and missing requirements. KIND lists one kind only, such as environment or codec; recipe lists
+    the recipes that `acwm fit` takes.
     """
     from rich.console import Console
 

@@ -37,7 +37,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
       data.path=data/mine            any parameter (see `acwm show RECIPE`)
       +small                         the small version: one device, even a CPU
       trainer.devices=8              any flag of Lightning's Trainer
-      resume=auto                    continue this command's run if it was begun
+      resume=auto                    continue this command's run if there is one
 
     `acwm fit resume=RUN` continues a run and takes everything from it, also its length. Overrides
     may change what does not affect the result, and trainer.max_steps.

@@ -10,7 +10,7 @@ CLOTH_NODES = 41
 """Number of nodes along each side of the cloth."""
 
 NODE_STRIDE, VELOCITY_STRIDE = 2, 4
-"""Of which every so many-th is recorded, with its position and its velocity."""
+"""Every n-th is recorded, with its position and its velocity."""
 
 ROPE_RADIUS = 0.035
 """Metres; the one for nominal factors."""

@@ -41,9 +41,9 @@ def train_estimator(
 ) -> None:
     """Train a network that reads the states of your own world.
 
-    DATA needs masks that name instances, and positions among its states. Which instance a position
-    belongs to and where it appears in the frame is found by itself. At the end the errors on other
-    episodes are printed; `acwm new estimator NAME --weights FILE` makes a package of it.
+    DATA needs masks that name instances, and positions among its states. The command matches
+    positions to instances, fits the camera, and at the end prints the errors on other episodes;
+    `acwm new estimator NAME --weights FILE` makes a package of it.
     """
     from acwm_estimators.train_fitted import train_fitted  # imports torch
 

@@ -62,7 +62,7 @@ def experiment(
     executor.steps.train='--time=24:00:00' for one kind of step.
 
     A file may also list tasks to solve by planning, such as planning: all tasks, with the models
-    that ship. OVERRIDES and --seeds are then of `acwm plan` if FILE trains nothing.
+    that ship. If FILE trains nothing, OVERRIDES and --seeds are those of `acwm plan`.
 
     With --grid, FILE is a recipe: `acwm experiment push_cube_small --grid model.layers=2,3
     training.learning_rate=1e-3,4e-3` trains it four times and makes one table of the four.

@@ -88,9 +88,9 @@ class HDF5(Format):
         """Import an HDF5 file, or a folder of them.
 
         Layouts of robomimic, LIBERO, ACT/ALOHA, stable-worldmodel and acwm are known. For any
-        other, say where in the group of an episode its frames and actions lie, e.g. --video
-        obs/front --actions actions; every group that has both is an episode, or several in a row
-        where an array such as ep_len or episode_index says so.
+        other, name the frames and actions in the group of an episode, e.g. --video obs/front
+        --actions actions; every group that has both is an episode, or several in a row where an
+        array such as ep_len or episode_index says so.
 
         Args:
             root: the file or folder.

@@ -74,8 +74,8 @@ class MCAP(Format):
         """Import an MCAP file, or a folder of them, one episode each.
 
         Messages of images (CompressedImage of ROS 2 or Foxglove), of video (CompressedVideo of
-        Foxglove in H.264 or H.265) and of numbers are brought together by the times in their
-        headers, or, where these have none of the same clock, at which they were logged.
+        Foxglove in H.264 or H.265) and of numbers are matched by the times in their headers, or by
+        the times of the log if the headers share no clock.
 
         Args:
             root: the file or folder.

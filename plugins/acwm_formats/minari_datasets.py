@@ -66,7 +66,7 @@ class Minari(Format):
         channels: Channels | None = None,
         follow_links: bool = False,
     ) -> RecordedDataset:
-        """Import a Minari dataset, whose observations are images or have some.
+        """Import a Minari dataset, whose observations are or contain images.
 
         Args:
             root: the dataset's folder, in which data lies.

@@ -113,11 +113,10 @@ class Videos(Format):
 
         Each video in ROOT (mp4, mov, mkv, webm, avi, gif), or folder of pictures, has a table of
         the same name: csv, tsv, npy, npz, json, jsonl or parquet. Or ROOT has a folder per episode,
-        with a video or folder of pictures per camera and one table. Or one table in ROOT is for
-        all, and a column of it, such as episode or video, tells which; pictures called
-        ep_0_step_0.png and the like are an episode per first number. Rows belong to frames by a
-        column of times (time, timestamp, t; time_ms and the like are in that unit), by a column
-        frame, or by their place.
+        with a video or folder of pictures per camera and one table. One table in ROOT may cover all
+        videos, with a column such as episode or video. Pictures named like ep_0_step_0.png are an
+        episode per first number. Rows belong to frames by a column of times (time, timestamp, t;
+        time_ms and the like are in that unit), by a column frame, or by their number.
 
         Args:
             root: the folder.

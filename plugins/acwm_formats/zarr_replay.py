@@ -94,7 +94,7 @@ class ZarrReplay(Format):
     ) -> RecordedDataset:
         """Import a Zarr replay buffer with data/… of all episodes and meta/episode_ends.
 
-        Arrays of other names that say where episodes are, such as meta/episode_lengths, will do.
+        Other arrays that mark episodes, such as meta/episode_lengths, also work.
 
         Args:
             root: the folder, or a .zarr.zip file.

@@ -41,7 +41,7 @@ from acwm_core.training.threads import wait_without_spinning
 def play(runs: tuple[Path, ...], **options: Any) -> None:
     """Play with the model of RUN beside the simulator, in a browser.
 
-    Both start from the same frame and get your actions, by keyboard, mouse, touch or gamepad.
+    Both start from the same frame and receive your actions from keyboard, mouse, touch or gamepad.
     A model of recorded data has the recorded video beside it, which does not follow your actions.
     Several runs make a menu; without RUN, it shows the installed trained models. Only this machine
     can open the page. Ctrl-C stops it.

@@ -168,11 +168,11 @@ def rank(
 ) -> None:
     """Rank policies at TASK by rolling them out in the model of RUN.
 
-    The same policies act in the true simulator from the same starts, which tells how far the
-    model's ranking can be trusted: correlations, rank violations, optimism, and what is lost by
-    choosing actions as the model would. Policies of your own see what the model predicts (closed
-    loop); scripted ones look at the simulator, so the model is given the actions they take there
-    (open loop). Stopped at any point, the same command resumes.
+    The same policies act in the true simulator from the same starts, which shows how far the
+    model's ranking can be trusted: correlations, rank violations, optimism, and the loss from
+    choosing actions as the model would. Your own policies see the model's predictions (closed
+    loop); scripted ones need the simulator, so the model receives the actions that they take there
+    (open loop). If it is interrupted, run the same command again to continue.
     """
     from acwm_planning.policies.scripted import parse_policy
 

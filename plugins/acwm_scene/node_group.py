@@ -69,7 +69,7 @@ class NodeGroup(Group):
         stretch: share by which neighbours may get further apart than in the given frame; None if
             nothing keeps them together.
         unit: metres that count as one, a few times the distance of the nodes that are moved.
-        every: every so many-th node along each side is moved and painted.
+        every: every n-th node along each side is moved and painted.
     """
 
     def __init__(

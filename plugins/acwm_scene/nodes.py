@@ -49,7 +49,7 @@ class NodeLayout:
         agents: number of agents A.
         axes: coordinates of each place, 2 or 3.
         nodes: nodes along a rope, or along both sides of a cloth, as they were recorded.
-        every: of which every so many-th along each side are kept, from the first one on.
+        every: every n-th node along each side is kept, from the first on.
         unit: metres that count as one.
 
     Attributes:

@@ -56,10 +56,10 @@ class SceneDynamics(Predictor):
         blocks: number of residual blocks that draw.
         noise: numbers that the future of each body, or of each other group, depends on; 0 for a
             model that predicts one future.
-        stretch: share by which neighbouring nodes of a rope or cloth may get further apart than in
-            the given frame; None if nothing keeps them together.
+        stretch: share by which neighbouring nodes of a rope or cloth may move apart, relative to the
+            given frame; None is unlimited.
         unit: metres that count as one in bodies and nodes; by default it follows from the camera.
-        every: of the nodes of a rope or cloth, every so many-th along each side is moved.
+        every: every n-th node of a rope or cloth, along each side, is moved.
 
     Attributes:
         noise: numbers that a draw depends on, of all groups together.

@@ -19,7 +19,7 @@ from acwm_templates.kinds import KINDS
 )
 @click.option("--weights", type=FOLDER, help="Of an estimator: a file of `acwm train-estimator`.")
 def new(kind: str, name: str, out: Path | None, environment: str, weights: Path | None) -> None:
-    """Start a plugin of your own.
+    """Start your own plugin.
 
     Writes a working package with a component called NAME (in snake_case) and tests; change it
     piece by piece. KIND is one of:

@@ -9,6 +9,6 @@ def register_commands(registry: Registry) -> None:
     registry.add(
         "new",
         "acwm_templates.commands:new",
-        summary="start a plugin of your own",
+        summary="start your own plugin",
         after="check",
     )

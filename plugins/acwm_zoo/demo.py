@@ -49,7 +49,7 @@ class Step(NamedTuple):
 def demo(out: Path | None, quick: bool) -> None:
     """Simulate, train, evaluate and report in one go.
 
-    Takes about nine minutes on two CPU cores: shows the trained model that ships beside the
+    Takes about ten minutes on two CPU cores: compares the trained model that ships with the
     simulator, then simulates a small dataset, trains a world model, evaluates it and adds it to
     the report in runs/demo (with --quick, runs/demo_quick). If it is interrupted, run the same
     command again to continue.
