@@ -56,8 +56,8 @@ class SceneDynamics(Predictor):
         blocks: number of residual blocks that draw.
         noise: numbers that the future of each body, or of each other group, depends on; 0 for a
             model that predicts one future.
-        stretch: share by which neighbouring nodes of a rope or cloth may move apart, relative to the
-            given frame; None is unlimited.
+        stretch: share by which neighbouring nodes of a rope or cloth may move apart, relative to
+            the given frame; None is unlimited.
         unit: metres that count as one in bodies and nodes; by default it follows from the camera.
         every: every n-th node of a rope or cloth, along each side, is moved.
 
