@@ -16,8 +16,9 @@ from tests.play.test_server import dark, played
 
 
 @pytest.fixture(autouse=True)
-def known_drivers():
+def known_drivers(monkeypatch):
     drivers.register()
+    drivers.plan_briefly(monkeypatch)
     drivers.Stuck.begun.clear()
     drivers.Stuck.stopped.clear()
 
