@@ -2,7 +2,7 @@
 # # Load a model and look at it
 
 # %% [markdown]
-# acwm ships a trained model of `push_cube`. It has 1 M parameters and predicts video of 64×64
+# acwm ships a trained model of `push_cube`. It has 1.7 M parameters and predicts video of 64×64
 # pixels. `acwm.load` takes the name of a model, a run folder or `hf://ORG/NAME`.
 
 # %%
@@ -35,7 +35,7 @@ truth = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255  # [T, 3, H
 # %% [markdown]
 # ## What the model predicts
 #
-# The model gets the first frame and the actions, one row per frame. No frame follows the last row.
+# The model takes the first frame and the actions, one row per frame. No frame follows the last row.
 
 # %%
 rows = torch.from_numpy(np.stack([*actions, np.zeros_like(actions[0])]))
