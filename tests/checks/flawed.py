@@ -195,7 +195,7 @@ class PerturbsNothing(Disc):
         rng.normal(0, amount, 2)
 
 
-@FLAWS.caught_by("perturbed start is close", "is seen")
+@FLAWS.caught_by("perturbed start is close", "is visible")
 class PerturbsFar(Disc):
     def _perturb(self, amount, rng):
         super()._perturb(200 * amount, rng)

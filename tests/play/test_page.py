@@ -130,7 +130,7 @@ def test_a_killed_server_is_told_and_found_again(browser, served):
     scene = page.evaluate("() => document.body.dataset.scene")
     served.kill()
     until(page, "!document.getElementById('banner').hidden")
-    assert "The server is gone" in page.inner_text("#banner")
+    assert "does not respond" in page.inner_text("#banner")
     served.start()
     until(page, "document.getElementById('banner').hidden")
     page.evaluate("() => { document.body.dataset.alone = 0; }")
