@@ -232,5 +232,5 @@ def test_pictures_by_time_or_camera_are_no_episodes(tmp_path):
 def test_one_video_of_several_episodes_is_refused(tmp_path, column):
     write_clip(tmp_path / "a.mp4", range(6), at(*range(6)), 10, Clip())
     (tmp_path / "a.csv").write_text(f"{column},x\n0,1\n0,2\n0,3\n1,4\n1,5\n1,6\n")
-    with pytest.raises(DataError, match=f"column {column} .* tells 2 episodes apart"):
+    with pytest.raises(DataError, match=f"column {column} .* numbers 2 episodes"):
         Videos().read(tmp_path).splits[0]
