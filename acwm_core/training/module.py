@@ -32,6 +32,7 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     update_average,
 )
+from acwm_core.training.precision import updates_in_bfloat16
 from acwm_core.training.preparation import PreparationClips
 
 TRAIN_NOISE, VALIDATION_NOISE, TRAIN_STARTS = 0, 1, 2
@@ -194,7 +195,8 @@ class TrainingModule(L.LightningModule):
         config, max_steps = self.config, self.trainer.max_steps
         # A gradient scaler must unscale before the norm is measured; fused optimisers do so after.
         fused = self.trainer.precision != "16-mixed"
-        optimizer = build_optimizer(self.world_model, config, fused=fused)
+        bfloat16 = updates_in_bfloat16(self.trainer.precision, self.device)
+        optimizer = build_optimizer(self.world_model, config, fused=fused, bfloat16=bfloat16)
         schedule = LambdaLR(optimizer, lambda step: learning_rate_factor(step, config, max_steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

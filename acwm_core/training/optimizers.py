@@ -17,14 +17,18 @@ from acwm_core.errors import AcwmWarning
 from acwm_core.model.dynamics import hidden_matrices
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.config import TrainingConfig
+from acwm_core.training.muon import Float32Muon
 
 
-def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -> Optimizer:
+def build_optimizer(
+    module: nn.Module, config: TrainingConfig, *, fused: bool, bfloat16: bool = True
+) -> Optimizer:
     """Build AdamW, or Muon for the hidden matrices of `module` and AdamW for all else.
 
     Args:
         module: the module to train; a `WorldModel` defines itself which are its hidden matrices.
         fused: whether AdamW uses its fused kernel.
+        bfloat16: whether Muon computes updates in bfloat16, as PyTorch does, and not in float32.
     """
     settings: dict[str, Any] = {"lr": config.learning_rate, "betas": config.betas, "fused": fused}
     hidden: list[nn.Parameter] = []
@@ -40,7 +44,7 @@ def build_optimizer(module: nn.Module, config: TrainingConfig, *, fused: bool) -
     if not hidden:
         return AdamW(parameter_groups(module, config.weight_decay), **settings)
     others = parameter_groups(module, config.weight_decay, without=hidden)
-    muon = Muon(
+    muon = (Muon if bfloat16 else Float32Muon)(
         hidden,
         lr=config.learning_rate,
         weight_decay=config.weight_decay,

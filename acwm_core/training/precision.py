@@ -49,6 +49,16 @@ def automatic_precision(accelerator: object) -> str:
     return "bf16-mixed" if is_cpu and bfloat16_is_fast() else "32-true"
 
 
+def updates_in_bfloat16(precision: object, device: torch.device) -> bool:
+    """Whether Muon may compute its updates in bfloat16: not where that is emulated.
+
+    A CPU does as the run does, whose precision a resumed run keeps.
+    """
+    if device.type == "cuda":
+        return gpu_has_bfloat16()
+    return device.type != "cpu" or canonical(precision).startswith("bf16")
+
+
 def with_recorded_precision(recipe: Recipe, of_run: Recipe, checkpoint: Path) -> Recipe:
     """The recipe, with the precision of the run to resume unless it names one itself.
 

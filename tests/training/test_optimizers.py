@@ -12,6 +12,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 from acwm_core.training.config import TrainingConfig
 from acwm_core.training.fit import fit
 from acwm_core.training.module import TrainingModule
+from acwm_core.training.muon import Float32Muon
 from acwm_core.training.optimizers import (
     JoinedOptimizer,
     averaged_copy,
@@ -21,6 +22,7 @@ from acwm_core.training.optimizers import (
     learning_rate_factor,
     parameter_groups,
 )
+from acwm_core.training.precision import updates_in_bfloat16
 from acwm_core.training.run_folder import RunFolder
 from tests.tiny import tiny_recipe, tiny_world_model
 from tests.training.runs import numbers
@@ -84,6 +86,44 @@ def test_joined_optimizers_do_what_each_would_do_alone():
         adamw.step()
     for mine, theirs in zip(one.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(mine, theirs)
+
+
+def test_muon_in_float32_does_what_pytorchs_does_but_for_the_rounding(monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "bfloat16", torch.Tensor.float)
+    torch.manual_seed(0)
+    shapes = ((4, 12), (12, 4), (6, 6))
+    mine, theirs = ([torch.nn.Parameter(torch.randn(shape)) for shape in shapes] for _ in range(2))
+    for one, other in zip(mine, theirs, strict=True):
+        other.data.copy_(one)
+    settings = {"lr": 0.02, "weight_decay": 0.1, "adjust_lr_fn": "match_rms_adamw"}
+    optimizers = Float32Muon(mine, **settings), Muon(theirs, **settings)
+    for _ in range(3):
+        gradients = [torch.randn(shape) for shape in shapes]
+        for weights, optimizer in zip((mine, theirs), optimizers, strict=True):
+            for each, gradient in zip(weights, gradients, strict=True):
+                each.grad = gradient.clone()
+            optimizer.step()
+    for one, other in zip(mine, theirs, strict=True):
+        torch.testing.assert_close(one, other)
+    optimizers[0].load_state_dict(optimizers[1].state_dict())  # either goes on with the other's
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "has_bfloat16", "expected"),
+    [
+        ("bf16-mixed", "cpu", False, True),
+        ("32-true", "cpu", True, False),
+        ("64-true", "cpu", True, False),
+        ("32-true", "cuda", True, True),
+        ("16-mixed", "cuda", False, False),
+        ("32-true", "mps", False, True),
+    ],
+)
+def test_muon_computes_in_bfloat16_where_that_is_fast(
+    precision, device, has_bfloat16, expected, monkeypatch
+):
+    monkeypatch.setattr("acwm_core.training.precision.gpu_has_bfloat16", lambda: has_bfloat16)
+    assert updates_in_bfloat16(precision, torch.device(device)) == expected
 
 
 def test_a_learning_rate_of_a_joined_group_reaches_its_part():
