@@ -82,6 +82,8 @@ class ClipData(L.LightningDataModule):
 
         Of a value that never changes, or by the rounding of its field alone, the deviation is one.
         """
+        if not self.config.states:
+            return torch.zeros(0), torch.ones(0)
         scales = [self._scale_of(name) for name in self.config.states]
         mean, std = (np.concatenate(each) for each in zip(*scales, strict=True))
         return torch.tensor(mean, dtype=torch.float32), torch.tensor(std, dtype=torch.float32)

@@ -127,7 +127,8 @@ def _train(
     clips = DataConfig(**recipe.data)
     kind = GrowingClipData if clips.growing else ClipData
     data = kind(clips, episodes, world_model.codec, config.seed)
-    module, preemption = TrainingModule(world_model, config), Preemption(run)
+    module = TrainingModule(world_model, config, resumed=checkpoint is not None)
+    preemption = Preemption(run)
     before = Recipe.from_yaml(run.recipe) if checkpoint else None
     schedule = ResumedSchedule(before.trainer.get("max_steps", -1) if before else None)
     flags = recipe.trainer
@@ -210,7 +211,10 @@ def _with_states(recipe: Recipe, episodes: EpisodeDataset) -> Recipe:
     """The recipe with the fields of the state that its model learns if it names none."""
     model = catalog().component("model", recipe.model.name).load()
     choose = getattr(model, "default_states", DynamicsModel.default_states)
-    if recipe.data.get("states") or choose.__func__ is DynamicsModel.default_states.__func__:
+    if (
+        recipe.data.get("states") is not None
+        or choose.__func__ is DynamicsModel.default_states.__func__
+    ):
         return recipe
     card = episodes.card.environment
     names = [each.name for each in card.state]

@@ -70,8 +70,11 @@ class TrainingModule(L.LightningModule):
         gradient_norm: gradient norm of the current step before clipping; set by `NanGuard`.
     """
 
-    def __init__(self, world_model: WorldModel, config: TrainingConfig) -> None:
+    def __init__(
+        self, world_model: WorldModel, config: TrainingConfig, *, resumed: bool = False
+    ) -> None:
         super().__init__()
+        self._resumed = resumed
         self.world_model = world_model
         self.config = config
         self.averaged = averaged_copy(world_model)
@@ -84,9 +87,8 @@ class TrainingModule(L.LightningModule):
         """Let the objective prepare the model; the average starts as the prepared weights."""
         world_model, data = self.world_model, cast(Any, self.trainer).datamodule
         clips = PreparationClips(world_model, data, self.config.seed)
-        resumed = self.trainer.ckpt_path is not None
         with noting("in preparing the model", *world_model.children()):
-            world_model.objective.prepare(world_model.model, clips, resumed=resumed)
+            world_model.objective.prepare(world_model.model, clips, resumed=self._resumed)
         self.averaged.to(world_model.device)
         update_average(self.averaged, world_model, 0)
 

@@ -1,13 +1,16 @@
-"""The training clips without their pictures, as an objective prepares a model with them."""
+"""The training clips, as an objective prepares a model with them."""
 
 from __future__ import annotations
 
 import functools
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from acwm_core.model.conditioner import Conditioning
+from acwm_core.model.shapes import Latent
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.data import ClipData
 
@@ -35,6 +38,15 @@ class PreparationClips:
         """The states of the clips of the commonest length, `[N, T, S]`."""
         return self._inputs["states"]
 
+    def latents(self, rows: Tensor) -> Latent:
+        """The latents of some clips; see `TrainingClips.latents`."""
+        clips, device = self._data.training_clips, self._data.device
+        batch = clips.batch(self._alike[rows.cpu().numpy()].tolist())
+        if "latents" in batch:
+            return batch["latents"].to(device)
+        with torch.no_grad():
+            return self._world_model.encode(batch["video"].to(device) / 255)
+
     def state_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the states; see `TrainingClips.state_scale`."""
         mean, std = self._data.state_scale()
@@ -53,9 +65,16 @@ class PreparationClips:
 
     @functools.cached_property
     def _inputs(self) -> dict[str, Tensor]:
-        clips, device = self._data.training_clips, self._data.device
+        device = self._data.device
         self._world_model.to(device)
-        lengths, counts = np.unique(clips.lengths, return_counts=True)
-        alike = np.flatnonzero(clips.lengths == lengths[counts.argmax()])
-        inputs = clips.inputs(alike.tolist())
-        return {name: inputs[name].to(device) for name in ("actions", "states")}
+        inputs = self._data.training_clips.inputs(self._alike.tolist())
+        actions = inputs["actions"].to(device)
+        states = inputs.get("states", actions[..., :0])
+        return {"actions": actions, "states": states.to(device)}
+
+    @functools.cached_property
+    def _alike(self) -> NDArray[np.int64]:
+        """Numbers of the clips of the commonest length."""
+        every = self._data.training_clips.lengths
+        lengths, counts = np.unique(every, return_counts=True)
+        return np.flatnonzero(every == lengths[counts.argmax()])

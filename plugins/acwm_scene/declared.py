@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from acwm_core.env.camera import Camera
 from acwm_core.env.card import EnvironmentCard, StateField
 from acwm_core.env.rotations import FOLDS
-from acwm_core.errors import RecipeError
 
 if TYPE_CHECKING:
     from acwm_scene.group import Group
@@ -87,16 +86,11 @@ def groups_of(card: EnvironmentCard | None, states: Sequence[str]) -> dict[str, 
 
     Nodes are the fields that are a curve or a surface. Bodies are the fields of positions and
     angles of the same instances, and what says which of these exist. With either, and without
-    values, positions of other instances are the agents. All else is values.
-
-    Raises:
-        RecipeError: there are no states to learn from.
+    values, positions of other instances are the agents. All else is values. Without states there
+    are no groups.
     """
     if card is None or not states:
-        raise RecipeError(
-            "a scene learns from states: name them in data.states, or choose a model that needs "
-            "none, such as by +recurrent"
-        )
+        return {"specs": {}, "state_size": 0}
     starts, size = dict[str, int](), 0
     for name in states:
         starts[name] = size

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from acwm_core.errors import TrainingError
 from acwm_core.executors import progress_bar
@@ -19,18 +19,18 @@ RATE, WARMUP, CLIPPED = 3e-3, 100, 0.5
 """Peak learning rate, the steps until it is reached, and the largest norm of the gradient."""
 
 
-def learn_motion(model: SceneDynamics, clips: TrainingClips, steps: int) -> None:
+def learn_motion(model: SceneDynamics, clips: TrainingClips, states: Tensor, steps: int) -> None:
     """Train what moves the scene and what embeds its actions, and then keep them as they are.
 
     Args:
         model: knows the scale of its states already.
-        clips: their states and actions; each is seen many times.
+        clips: their actions; each is seen many times.
+        states: of the clips, with what was read of their points, `[N, T, S + point_size]`.
         steps: 0 only marks what was learnt before, as a resumed run does.
 
     Raises:
         TrainingError: the loss stopped being finite.
     """
-    states = clips.states
     model.to(states.device)
     parameters = [*model.motion_parameters(), *clips.conditioner_parameters()]
     optimizer: Any = torch.optim.AdamW(parameters, RATE, weight_decay=1e-3)

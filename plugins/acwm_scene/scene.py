@@ -18,6 +18,7 @@ from acwm_core.model.shapes import Latent
 from acwm_scene.declared import GroupSpec, default_states, groups_of
 from acwm_scene.group import Group, at_frame, flattened, picked, stacked, tree_map
 from acwm_scene.layers import FrameDrawing, MatrixConv
+from acwm_scene.points import PointGroup
 from acwm_scene.upgrade import upgraded
 
 
@@ -49,11 +50,13 @@ class SceneDynamics(Predictor):
     Args:
         latent_channels: channels C of the codec.
         temporal_stride: video frames per latent frame of the codec.
-        specs: the groups, by name; they follow from the card.
+        specs: the groups that the card declares, by name.
         state_size: number of values S of the states.
         channels: size of the grid that is drawn on and of the layers that look.
         width: size of the conditioner's modulation, and of what the blocks are modulated by.
         blocks: number of residual blocks that draw.
+        points: number of points that it finds by itself, beside what is declared; see
+            `acwm_scene.points`.
         noise: numbers that the future of each body, or of each other group, depends on; 0 for a
             model that predicts one future.
         stretch: share by which neighbouring nodes of a rope or cloth may move apart, relative to
@@ -82,6 +85,7 @@ class SceneDynamics(Predictor):
         channels: int = 96,
         width: int = 192,
         blocks: int = 4,
+        points: int = 0,
         noise: int = 0,
         stretch: float | None = None,
         unit: float | None = None,
@@ -90,16 +94,30 @@ class SceneDynamics(Predictor):
         super().__init__()
         if min(channels, width, blocks, every) < 1:
             raise RecipeError("channels, width, blocks and every of a scene must be at least 1")
+        if points < 0:
+            raise RecipeError(f"model.points is {points}; it must be 0 or more")
         if noise < 0 or not (stretch is None or stretch >= 0) or not (unit is None or unit > 0):
             raise RecipeError("model.noise and model.stretch are 0 or more, and model.unit above 0")
         self.latent_channels, self.stride, self.width = latent_channels, temporal_stride, width
         self.state_size = state_size
-        specs = specs or {"values": GroupSpec("values", columns=tuple(range(state_size)))}
+        if specs is None:
+            specs = {"values": GroupSpec("values", columns=tuple(range(state_size)))}
+        if not specs and not points:
+            raise RecipeError(
+                "a scene learns from states: name them in data.states; or let it find points by "
+                "itself, by model.points=16; or choose a model without states, such as by "
+                "+recurrent"
+            )
         self.columns = {name: list(spec.columns) for name, spec in specs.items()}
         sizes = {"latent_channels": latent_channels, "stride": temporal_stride}
         sizes |= {"channels": channels, "width": width, "noise": noise}
         options = {"stretch": stretch, "unit": unit, "every": every}
         made = {name: spec.build(**sizes, **options) for name, spec in specs.items()}
+        self.point_size = 0
+        if points:
+            made["points"] = group = PointGroup(points, **sizes)
+            self.point_size = group.size
+            self.columns["points"] = [*range(state_size, state_size + group.size)]
         self.groups = nn.Module()  # a ModuleDict has an attribute `values` of its own
         for name, group in made.items():
             self.groups.add_module(name, group)
@@ -200,8 +218,11 @@ class SceneDynamics(Predictor):
         """The states that it would draw; see `Predictor.predict_states`.
 
         Raises:
-            RecipeError: the weights do not hold the scale of the states.
+            RecipeError: it learnt no states but its points, or the weights do not hold their
+                scale.
         """
+        if not self.state_size:
+            raise RecipeError("this scene knows only points that it found itself, and no states")
         if not all(group.is_prepared for _, group in self._groups()):
             raise RecipeError(
                 "these weights do not hold the scale of their states, as an earlier version made "
@@ -267,19 +288,45 @@ class SceneDynamics(Predictor):
             )
         return {name: group.embed(conditioning.modulation) for name, group in self._groups()}
 
+    @property
+    def points(self) -> PointGroup | None:
+        """The points that it finds by itself, if it does."""
+        return dict(self._groups()).get("points")  # pyright: ignore[reportReturnType]
+
+    def with_points(self, states: Tensor, latents: Latent) -> Tensor:
+        """States `[B, T, S]`, and after them the points that it reads from all latents.
+
+        Args:
+            states: as they were recorded; S may be 0.
+            latents: of the clips, `[B, L, C, h, w]`.
+
+        Returns:
+            `[B, T, S + point_size]`; all video frames of a latent frame have its points.
+        """
+        if self.points is None:
+            return states
+        read = self.points.sight(latents.flatten(0, 1)).flatten(1)
+        read = read.unflatten(0, latents.shape[:2]).repeat_interleave(self.stride, 1)
+        return torch.cat([states, read[:, self.stride - 1 :]], 2)
+
     def encode(self, states: Tensor) -> dict[str, Any]:
-        """The courses in states `[B, T, S]`, as they were recorded, by group."""
-        if states.shape[2] != self.state_size:
-            raise ShapeError(f"states have {states.shape[2]} values, not {self.state_size}")
+        """The courses in states `[B, T, S]`, as they were recorded, by group.
+
+        The states of points come last; see `with_points`.
+        """
+        size = self.state_size + self.point_size
+        if states.shape[2] != size:
+            raise ShapeError(f"states have {states.shape[2]} values, not {size}")
         return {
             name: group.encode(states[..., self.columns[name]].float())
             for name, group in self._groups()
         }
 
     def decode(self, courses: Mapping[str, Any]) -> Tensor:
-        """The inverse of `encode`, `[B, T, S]`."""
+        """The inverse of `encode`, `[B, T, S]`, without points."""
         parts = {name: group.decode(courses[name]) for name, group in self._groups()}
         first = next(iter(parts.values()))
+        parts.pop("points", None)
         states = first.new_empty(*first.shape[:2], self.state_size)
         for name, values in parts.items():
             states[..., self.columns[name]] = values

@@ -90,6 +90,18 @@ def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkey
     assert_same(whole, run)
 
 
+def test_a_killed_run_resumes_with_the_same_points(data, tmp_path, monkeypatch):
+    """Points and their motion were learnt before the first picture, and are not learnt again."""
+    objective = {"name": "scene", "point_steps": 3, "motion_steps": 3}
+    asked = {"model": {**SCENE, "points": 2}, "objective": objective, "data": {"states": []}}
+    whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
+    monkeypatch.setattr(Kill, "batch", 7)
+    run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
+    monkeypatch.setattr("acwm_scene.point_training.pair_loss", None)
+    fit(killable(data, **asked), tmp_path / "unused", resume=run.path)
+    assert_same(whole, run)
+
+
 def test_the_scale_of_growing_data_is_that_of_the_start(data, tmp_path, monkeypatch):
     """A run that was killed goes on with the scale that it began with, whatever data came since."""
     grown = {"data": {**PLACES, "growing": True, "validation_episodes": 2}}

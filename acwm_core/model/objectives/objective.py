@@ -19,13 +19,13 @@ ModelT = TypeVar("ModelT", bound=DynamicsModel)
 
 
 class TrainingClips(Protocol):
-    """The clips that a run trains on, without their pictures; see `Objective.prepare`.
+    """The clips of the commonest length that a run trains on; see `Objective.prepare`.
 
     Attributes:
         seed: of the run.
         shows_progress: whether this process shows how far it is.
-        states: what to learn of the scene, as it was recorded, in the clips of the commonest
-            length, `[N, T, S]` on the device that trains.
+        states: what to learn of the scene, as it was recorded, `[N, T, S]` on the device that
+            trains; S is 0 if there is nothing.
     """
 
     @property
@@ -42,6 +42,10 @@ class TrainingClips(Protocol):
 
         Of a value that never changes, the deviation is 1.
         """
+        ...
+
+    def latents(self, rows: Tensor) -> Latent:
+        """The latents of some of these N clips, `[B, L, C, h, w]` on the device that trains."""
         ...
 
     def conditioning(self, rows: Tensor) -> Conditioning:
@@ -80,7 +84,8 @@ class Objective(ABC, Generic[ModelT]):
     def prepare(self, model: ModelT, clips: TrainingClips, *, resumed: bool) -> None:
         """Prepare a model before the first step of a training. Optional.
 
-        For what needs no pictures: to measure the data, to teach a part of the model, to freeze it.
+        For what is cheap without pictures, or needs few of them: to measure the data, to teach a
+        part of the model, to freeze it.
         It is called before the optimiser is built, in all processes alike.
 
         Args:

@@ -1,0 +1,166 @@
+"""Moves points: some with the actions, others because these push them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from acwm_scene.value_layers import ACTION, HIDDEN
+
+CORE = 32
+"""Numbers that actions move, and that points may follow."""
+
+IDENTITY, MEMORY, CHANNELS, OCTAVES = 16, 48, 64, 4
+"""Of the interaction of points: numbers that tell one point from another, the size of what each
+remembers, that of the hidden layers, and frequencies in which distances are seen."""
+
+STEP = 0.1
+"""Scale of a change in a video frame."""
+
+
+class Points(NamedTuple):
+    """The state of points in a video frame.
+
+    Attributes:
+        points: where they are and what they look like, `[B, K, 2 + F]`.
+        given: the same in the given frame.
+        scene: what is to be known of the given frame, `[B, HIDDEN]`.
+        led: where the core leads the points from the given frame, before it has moved,
+            `[B, K, 2 + F]`.
+        core: the numbers that actions move, `[B, CORE]`.
+        hidden: what moves them, `[B, HIDDEN]`.
+        pushed: how far interactions have moved each point, `[B, K, 2 + F]`.
+        memory: of each point, `[B, K, MEMORY]`.
+        chance: numbers that this future depends on, `[B, noise]`, of a model that draws.
+    """
+
+    points: Tensor
+    given: Tensor
+    scene: Tensor
+    led: Tensor
+    core: Tensor
+    hidden: Tensor
+    pushed: Tensor
+    memory: Tensor
+    chance: tuple[Tensor, ...] = ()
+
+
+class PointMotion(nn.Module):
+    """Two ways in which points move, which are added.
+
+    Actions move a few numbers, the core, and points follow these and the given frame: so errors of
+    points that belong together, as those of one arm do, do not add up one by one. And each point
+    gets messages from all others, as in an interaction network (Battaglia et al. 2016, arXiv
+    1612.00222): so things are pushed.
+
+    Args:
+        points: number of points K.
+        features: number of features F of each.
+        width: size of the embedded actions.
+        stride: video frames per latent frame, whose actions are embedded together.
+        noise: numbers of a draw that the motion depends on; 0 for one future.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, points: int, features: int, width: int, stride: int, noise: int = 0) -> None:
+        super().__init__()
+        self.points, entries = points, 2 + features
+        size = points * entries
+        self.register_buffer("mean", torch.zeros(points, entries))
+        self.register_buffer("std", torch.ones(points, entries))
+        self.actions = nn.Linear(width, stride * ACTION)
+        self.chance = nn.Linear(noise, ACTION, bias=False) if noise else None
+        self.core, self.start = nn.Linear(size, CORE), nn.Linear(size, HIDDEN)
+        self.gru = nn.GRUCell(ACTION + CORE, HIDDEN)
+        self.change = nn.Sequential(
+            nn.Linear(HIDDEN + ACTION + CORE, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, CORE)
+        )
+        self.by_core, self.by_scene = nn.Linear(CORE, HIDDEN), nn.Linear(size, HIDDEN)
+        self.follow = nn.Sequential(
+            nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, size)
+        )
+        self.identity = nn.Parameter(torch.randn(points, IDENTITY))
+        own = IDENTITY + entries
+        self.remember = nn.Linear(own, MEMORY)
+        self.apart = nn.Linear(2 + 4 * OCTAVES, CHANNELS)
+        self.receiver, self.sender = (nn.Linear(own + MEMORY + ACTION, CHANNELS) for _ in range(2))
+        self.message = nn.Linear(CHANNELS, CHANNELS)
+        self.update = nn.GRUCell(own + ACTION + CHANNELS + 4 * OCTAVES, MEMORY)
+        self.push = nn.Sequential(
+            nn.Linear(MEMORY + own + ACTION + CHANNELS, CHANNELS),
+            nn.SiLU(),
+            nn.Linear(CHANNELS, entries),
+        )
+
+    def embed(self, modulation: Tensor) -> Tensor:
+        """Embedded actions `[B, L, width]` by video frames, `[B, L stride, ACTION]`."""
+        with torch.autocast(modulation.device.type, enabled=False):  # errors add up
+            actions = self.actions(modulation.float())
+        return actions.reshape(len(actions), -1, ACTION)
+
+    def begin(self, points: Tensor) -> Points:
+        """The state of points `[B, K, 2 + F]` at rest."""
+        values = ((points - self.mean) / self.std).flatten(1)
+        core, scene = self.core(values), self.by_scene(values)
+        memory = torch.tanh(self.remember(self._own(points)))
+        return Points(
+            points,
+            given=points,
+            scene=scene,
+            led=self._led(core, scene),
+            core=core,
+            hidden=torch.tanh(self.start(values)),
+            pushed=torch.zeros_like(points),
+            memory=memory,
+        )
+
+    def forward(self, action: Tensor, state: Points) -> Points:
+        """The state one video frame later, by embedded actions `[B, ACTION]`."""
+        if self.chance:
+            action = action + self.chance(*state.chance)
+        inputs = torch.cat([action, state.core], -1)
+        hidden = self.gru(inputs, state.hidden)
+        core = state.core + STEP * self.change(torch.cat([hidden, inputs], -1))
+        push, memory = self._pushed(state.points, state.memory, action)
+        pushed = state.pushed + STEP * push
+        led = self._led(core, state.scene) - state.led
+        return state._replace(
+            points=state.given + led + pushed,
+            core=core,
+            hidden=hidden,
+            pushed=pushed,
+            memory=memory,
+        )
+
+    def _led(self, core: Tensor, scene: Tensor) -> Tensor:
+        return self.follow(self.by_core(core) + scene).view(-1, *self.std.shape) * self.std
+
+    def _own(self, points: Tensor) -> Tensor:
+        return torch.cat([self.identity.expand(len(points), -1, -1), points], -1)
+
+    def _pushed(self, points: Tensor, memory: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """What each point hears from all others moves it, `[B, K, 2 + F]`; and its memory."""
+        own = self._own(points)
+        action = action[:, None].expand(-1, self.points, -1)
+        node = torch.cat([own, memory, action], -1)
+        places = points[..., :2]
+        apart = self.apart(waves(places[:, None] - places[:, :, None]))
+        edges = apart + self.receiver(node)[:, :, None] + self.sender(node)[:, None]
+        messages = functional.silu(self.message(functional.silu(edges).mean(2)))
+        inputs = torch.cat([own, action, messages], -1)
+        seen = torch.cat([inputs, waves(places)[..., 2:]], -1)
+        memory = self.update(seen.flatten(0, 1), memory.flatten(0, 1)).view_as(memory)
+        return self.push(torch.cat([memory, inputs], -1)), memory
+
+
+def waves(places: Tensor) -> Tensor:
+    """Coordinates `[…, 2]` with their sines and cosines in `OCTAVES` frequencies."""
+    octaves = 2.0 ** torch.arange(OCTAVES, device=places.device, dtype=places.dtype)
+    angles = (places[..., None] * (math.pi * octaves)).flatten(-2)
+    return torch.cat([places, angles.sin(), angles.cos()], -1)
