@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim import AdamW, Muon
+from torch.optim import AdamW
 
 from acwm_core.errors import TrainingError
 from acwm_core.executors import progress_bar
 from acwm_core.model.objectives.objective import TrainingClips
+from acwm_core.training.muon import Float32Muon
 from acwm_scene.points import PointGroup
 from acwm_scene.scene import SceneDynamics
 
@@ -76,7 +77,7 @@ def _train(model: SceneDynamics, clips: TrainingClips, steps: int, random: torch
     others = [each for each in weights if all(each is not matrix for matrix in matrices)]
     optimizers: list[Any] = [
         AdamW(others, RATE, betas=(0.9, 0.99), weight_decay=0.01),
-        Muon(matrices, lr=MATRIX_RATE, weight_decay=0.01),
+        Float32Muon(matrices, lr=MATRIX_RATE, weight_decay=0.01),
     ]
     loss = torch.zeros(())
     bar = progress_bar(
