@@ -20,7 +20,7 @@ from acwm_scene.scene import SceneDynamics
 CLIPS, DRAWN = 8, 4
 """Clips per step, and frames of each that are drawn on another one of it."""
 
-RATE, MATRIX_RATE, WARMUP, STEADY, CLIPPED = 2e-3, 0.02, 50, 0.2, 1.0
+RATE, MATRIX_RATE, WARMUP, STEADY, CLIPPED = 2e-3, 4e-3, 50, 0.2, 1.0
 """Peak learning rates of AdamW and of Muon, the steps until they are reached, the share of the
 training in which they stay, and the largest norm of the gradient."""
 
