@@ -39,6 +39,7 @@ class ClipData(L.LightningDataModule):
     with the very next clip, also on other devices.
 
     Attributes:
+        states: fields of the state to learn.
         frames: frames per clip: as many as the recipe says, but no more than the longest episode
             has.
 
@@ -55,6 +56,7 @@ class ClipData(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
+        self.states = config.states or ()
         self._split = self._divided()
         self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
         self._check_states()
@@ -70,7 +72,7 @@ class ClipData(L.LightningDataModule):
     def _check_states(self) -> None:
         """Refuse symmetries that do not say how they transform the states to learn."""
         card = self.episodes.card.environment
-        for name, symmetry in itertools.product(self.config.states, self._symmetries):
+        for name, symmetry in itertools.product(self.states, self._symmetries):
             if name in card.fields and not card.transforms(symmetry, name):
                 raise DataError(
                     f"data.states: the card of {self.episodes.path} does not say how the symmetry "
@@ -82,9 +84,9 @@ class ClipData(L.LightningDataModule):
 
         Of a value that never changes, or by the rounding of its field alone, the deviation is one.
         """
-        if not self.config.states:
+        if not self.states:
             return torch.zeros(0), torch.ones(0)
-        scales = [self._scale_of(name) for name in self.config.states]
+        scales = [self._scale_of(name) for name in self.states]
         mean, std = (np.concatenate(each) for each in zip(*scales, strict=True))
         return torch.tensor(mean, dtype=torch.float32), torch.tensor(std, dtype=torch.float32)
 
@@ -233,7 +235,7 @@ class ClipData(L.LightningDataModule):
             "indices": episodes,
             "temporal_stride": self.codec.temporal_stride,
             "given": self.config.context_frames,
-            "states": self.config.states,
+            "states": self.states,
             **of_clips,
         }
         if not cached:

@@ -36,7 +36,7 @@ def test_a_model_with_an_objective_of_its_own_brings_it():
         ["+recurrent", "+small"],  # which replaces the objective of the paper alone
     ):
         assert objective(*words) == ("regression", {"frames": None})
-    scene = {"state_weight": 0.3, "frames": None, "motion_steps": 0}
+    scene = {"state_weight": 0.3, "frames": None, "motion_steps": 0, "point_steps": 1000}
     assert objective("model=scene") == ("scene", scene)
     assert objective("+next_frame", "+scene") == (
         "scene",

@@ -138,7 +138,7 @@ def test_headings_sort_both_ways_by_number_and_by_word_also_with_keys(browser, p
 
 def wait_until(page, condition):
     """As `wait_for_function`, which needs the `eval` that the page's own policy forbids."""
-    for _ in range(200):
+    for _ in range(600):
         if page.evaluate(condition):
             return
         page.wait_for_timeout(100)
@@ -178,7 +178,7 @@ def test_the_first_screen_moves_and_tells_three_figures(browser, pages):
         box = each.bounding_box()
         assert box["y"] + box["height"] <= DESK["height"]
     truth = set()
-    for _ in range(200):
+    for _ in range(600):
         truth.add(int(pixels(panels[0])[:, 0].mean().round(-1)))
         if len(truth) > 2:
             break
@@ -192,7 +192,7 @@ def test_panels_are_cut_out_of_videos_with_and_without_masks(browser, pages, run
     page, _ = visit(browser, pages["many"], DESK)
     truth, prediction, _ = page.locator(f".moving[data-of^='{run}-'] canvas").all()
     truth.scroll_into_view_if_needed()
-    for _ in range(200):
+    for _ in range(600):
         red, blue = pixels(truth), pixels(prediction)
         if red.any() and blue.any():
             break

@@ -6,7 +6,6 @@ import pytest
 
 from acwm_core.env.camera import Camera
 from acwm_core.env.card import StateField
-from acwm_core.errors import RecipeError
 from acwm_core.plugins import catalog
 from acwm_scene.declared import default_states, groups_of, unit_of
 from tests.tiny import TinyWorld
@@ -93,6 +92,5 @@ def test_without_a_camera_or_kinds_all_are_values():
     assert angle.angles == (0, 1, 2, 3, 4)
 
 
-def test_a_scene_without_states_is_refused():
-    with pytest.raises(RecipeError, match=r"name them in data\.states"):
-        groups_of(card_of("push_cube"), ())
+def test_without_states_nothing_is_declared():
+    assert groups_of(card_of("push_cube"), ()) == {"specs": {}, "state_size": 0}

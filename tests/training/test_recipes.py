@@ -82,6 +82,7 @@ def data_of(tmp_path_factory):
         ("push_cube", ("+small", "+scene", "codec=compact_reference")),
         ("robot_arm", ("+small", "+scene")),
         ("push_rope", ("+small", "+scene")),
+        ("small", ("+points",)),
         ("cloth_move", ("+small", "+scene", "data.symmetries=true")),
         ("push_cube", ("+small", "+next_frame", "objective.own_past=0.5")),
     ],
@@ -89,8 +90,10 @@ def data_of(tmp_path_factory):
 def test_two_real_steps(recipe, words, data_of, tmp_path):
     chosen = compose(recipe, words)
     world = chosen.env.name if chosen.env else "push_cube"
-    states = chosen.model.name == "scene"
-    motion = ("objective.motion_steps=2",) * states
+    states = chosen.model.name == "scene" and "+points" not in words
+    motion = ("objective.motion_steps=2", "objective.point_steps=2") * (
+        chosen.model.name == "scene"
+    )
     fewer = ("model.layers=2",) * (chosen.model.name in LARGE)
     takes_two_steps(recipe, (*words, *motion, *fewer), data_of(world, states), tmp_path)
 
