@@ -56,9 +56,10 @@ def orthogonal(
     """
     a, b, c = coefficients
     is_tall = matrix.shape[0] > matrix.shape[1]
-    result = matrix.T if is_tall else matrix
-    result = result / result.norm().clamp(min=eps)
+    result = matrix.t() if is_tall else matrix
+    result = result / result.square().sum().sqrt().clamp(min=eps)
     for _ in range(steps):
-        gram = result @ result.T
-        result = torch.addmm(result, torch.addmm(gram, gram, gram, beta=b, alpha=c), result, beta=a)
-    return result.T if is_tall else result
+        gram = result @ result.t()
+        change = torch.addmm(gram, gram, gram, beta=b, alpha=c)
+        result = torch.addmm(result, change, result, beta=a)
+    return result.t() if is_tall else result

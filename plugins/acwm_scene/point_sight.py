@@ -54,7 +54,7 @@ class PointSight(Look):
 
     def forward(self, frame: Tensor) -> Tensor:
         """The points `[B, K, 2 + F]` in a latent frame `[B, C, h, w]`."""
-        size = frame.shape[-2:]
+        size = frame.shape[-2], frame.shape[-1]
         average = functional.adaptive_avg_pool2d(self.average, size)
         cells = cell_places(size, frame)
         inputs = [frame, frame - average, cells.expand(len(frame), -1, -1, -1)]
