@@ -216,7 +216,7 @@ def test_one_button_plays_and_pauses_all_videos_also_with_keys(browser, pages):
     page.get_by_role("button", name="Pause").focus()
     page.keyboard.press("Space")
     wait_until(page, f"{PLAYING} === 0")
-    slider = page.get_by_label("Place in the videos")
+    slider = page.get_by_label("Position in the videos")
     slider.fill("0.5")
     share = "document.querySelector('video').currentTime / document.querySelector('video').duration"
     wait_until(page, f"Math.abs({share} - 0.5) < 0.1")

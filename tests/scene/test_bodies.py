@@ -160,6 +160,7 @@ def learned(model, states, actions):
     return world
 
 
+@pytest.mark.ci
 def test_it_learns_how_agents_push_bodies():
     """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
     model = model_of_pucks(channels=48)
@@ -172,6 +173,7 @@ def test_it_learns_how_agents_push_bodies():
     assert (made[:, -1] - true[:, -1]).norm(dim=-1).mean() < 0.6 * moved.mean()
 
 
+@pytest.mark.ci
 def test_it_draws_what_cannot_be_known():
     """Pushes reach as far as chance has it: draws differ where pucks do, and as much."""
     reaches = np.random.default_rng(5)
@@ -247,6 +249,7 @@ def test_it_draws_true_states_and_learns_nothing_of_motion_by_it():
         model.read(given[:, :, :1])
 
 
+@pytest.mark.ci
 def test_it_finds_what_a_picture_shows():
     """A dot that is drawn at an agent's place, in a channel of its own, and one for each body."""
     torch.manual_seed(0)
@@ -283,6 +286,7 @@ def test_two_given_frames_tell_how_things_move():
     assert still.place_change.abs().max() == still.spin.abs().max() == 0
 
 
+@pytest.mark.ci
 def test_groups_combine():
     """Joints as values and pucks as bodies, in one scene: all that the suite asks of a model."""
     values = GroupSpec("values", (10, 11, 12), following=1)

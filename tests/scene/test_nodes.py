@@ -199,6 +199,7 @@ def test_agents_are_told_by_what_they_look_like_and_not_by_their_side():
     assert missed(sight, *pictures(left=1)) < 0.2
 
 
+@pytest.mark.ci
 def test_a_shadow_tells_how_far_away_an_agent_is():
     """On the right, training shows it in mirrored frames alone, lit from the other side."""
     torch.manual_seed(0)
@@ -301,6 +302,7 @@ def test_windows_are_seen_from_other_sides_and_ends():
     assert moved.float().mean() > 0.8
 
 
+@pytest.mark.ci
 def test_it_learns_how_agents_push_nodes(monkeypatch):
     """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
     monkeypatch.setattr(node_windows_module, "NODES", 4000)
@@ -314,6 +316,7 @@ def test_it_learns_how_agents_push_nodes(monkeypatch):
     assert off < 0.5 * (true[:, 0] - true[:, -1]).norm(dim=-1).mean()
 
 
+@pytest.mark.ci
 def test_it_finds_a_line_in_a_picture_from_either_end():
     torch.manual_seed(0)
     layout = NodeLayout(1, 2, [NODES], 1, 1.0)

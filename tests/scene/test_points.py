@@ -75,6 +75,7 @@ def explained(points, places):
 
 
 @torch.no_grad()
+@pytest.mark.ci
 def test_points_tell_where_things_are(learnt):
     latents, places, _ = balls(64, seed=2)
     points = learnt.model.points.sight(latents.flatten(0, 1))[..., :2].flatten(1)
@@ -82,6 +83,7 @@ def test_points_tell_where_things_are(learnt):
 
 
 @torch.no_grad()
+@pytest.mark.ci
 def test_a_frame_is_drawn_from_its_points_alone(learnt):
     model = learnt.model.eval()
     latents, _, _ = balls(64, seed=3)
@@ -93,6 +95,7 @@ def test_a_frame_is_drawn_from_its_points_alone(learnt):
 
 
 @torch.no_grad()
+@pytest.mark.ci
 def test_actions_move_them(learnt):
     latents, _, actions = balls(64, seed=4)
     true = states_with_points(learnt.model, clips_of(latents))

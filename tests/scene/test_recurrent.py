@@ -116,6 +116,7 @@ def drifting(batch, seed):
     return Batch(latents, Conditioning(torch.zeros(batch, 6, 16), None, None), [])
 
 
+@pytest.mark.ci
 def test_several_given_frames_show_velocities():
     """One frame leaves all of what follows unknown: its least error is E[(speed · n)²] = 11."""
     errors = {}
@@ -144,6 +145,7 @@ def test_wrong_sizes_are_refused():
         model(torch.zeros(1, 1, 4, 8, 8), Conditioning(None, None, None), 2)
 
 
+@pytest.mark.ci
 def test_it_learns_to_move_what_actions_move():
     """Better than standing still, and only under the true actions."""
     torch.manual_seed(0)

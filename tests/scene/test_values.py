@@ -42,6 +42,7 @@ def model_of_arms(following=0, angles=(), **parameters):
 
 
 @pytest.mark.parametrize("following", [0, 2])
+@pytest.mark.ci
 def test_it_learns_how_actions_move_states(following):
     """Some steps foretell whole clips of a lag, and where that leads the hand."""
     world = world_of(model_of_arms(following=following), stride=1, states=4)
@@ -69,6 +70,7 @@ def test_of_long_clips_a_step_moves_fewer(monkeypatch):
     torch.testing.assert_close(loss(8), few)
 
 
+@pytest.mark.ci
 def test_it_reads_what_a_picture_shows():
     """A dot in a channel of its own for each of two places; the states are where they are."""
     torch.manual_seed(0)

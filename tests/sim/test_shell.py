@@ -85,6 +85,7 @@ def test_a_home_that_nothing_can_be_written_to(usual, tmp_path):
     home.touch()
     (temporary := tmp_path / "temporary").mkdir()
     folders = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(temporary)}
+    folders["ACWM_CACHE"] = None
     assert drawn(tmp_path, ["reacher"], **folders) == ({"reacher": usual["reacher"]}, "")
     assert [*temporary.glob("acwm-*/taichi/*")]  # compiled kernels are kept there
     folders["TI_OFFLINE_CACHE_FILE_PATH"] = str(home / "kernels")
@@ -98,6 +99,6 @@ def test_a_home_that_nothing_can_be_written_to(usual, tmp_path):
 
 def test_no_home_at_all(usual, tmp_path):
     """As in a container whose user has no account."""
-    folders = {"HOME": None, "XDG_CACHE_HOME": None, "TMPDIR": str(tmp_path)}
+    folders = {"HOME": None, "XDG_CACHE_HOME": None, "TMPDIR": str(tmp_path), "ACWM_CACHE": None}
     digests, said = drawn(tmp_path, ["reacher"], **folders)
     assert (digests["reacher"], said) == (usual["reacher"], "")

@@ -15,7 +15,7 @@ from acwm_zoo.shipped import folder, shipped
 QUICK_FIT = [
     *("+quick", "trainer.max_steps=2", "training.sample_every_n_steps=0"),
     *("training.validate_every_n_steps=2", "training.checkpoint_every_n_steps=2"),
-    *("trainer.enable_progress_bar=false", "data.batch_size=2", "data.validation_episodes=1"),
+    *("trainer.enable_progress_bar=false", "data.batch_size=1", "data.validation_episodes=1"),
 ]
 QUICK_EVALUATION = [
     *("evaluation.episodes=2", "evaluation.frames=9", "evaluation.videos=0"),
@@ -44,7 +44,7 @@ def few(line, learns_motion):
     assert acwm == "acwm"
     if command == "generate":
         place = words.index("--episodes") + 1
-        counts = zip((3, 2, 2), words[place].split(","), strict=True)
+        counts = zip((2, 2, 2), words[place].split(","), strict=True)
         words[place] = ",".join(str(min(most, int(count))) for most, count in counts)
         words += ["--workers", "0"]
     if command == "fit":
