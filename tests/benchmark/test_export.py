@@ -83,6 +83,7 @@ def test_several_given_frames_are_several_pictures(truth, tmp_path):
     np.testing.assert_array_equal(np.stack(shown), episode.video[:3])
 
 
+@pytest.mark.ci
 def test_the_public_set_can_be_simulated_by_anyone_and_a_secret_one_cannot(parts, tmp_path):
     options = {"episodes": 2, "workers": 0, "progress": False, "size": 32}
     made = {

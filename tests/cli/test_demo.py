@@ -65,6 +65,7 @@ def test_the_time_left_is_that_of_all_steps(monkeypatch, capsys):
     ]
 
 
+@pytest.mark.ci
 def test_data_that_was_made_before_is_told_so(tmp_path):
     recipe = compose("demo", [f"data.path={tmp_path}"])
     assert demo._generate(recipe, tmp_path, {"ind_test": 1})

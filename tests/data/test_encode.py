@@ -42,6 +42,7 @@ def start(data, log, free):
     )
 
 
+@pytest.mark.ci
 def test_two_processes_divide_the_shards_and_one_finishes_what_a_killed_one_began(
     many_shards, tmp_path
 ):

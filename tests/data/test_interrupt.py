@@ -107,6 +107,7 @@ def test_killed_at_any_moment_it_makes_nothing_twice(tmp_path, uninterrupted):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="watches processes in /proc")
+@pytest.mark.ci
 def test_a_killed_worker_is_told_and_the_command_goes_on(tmp_path, uninterrupted):
     out = tmp_path / "data"
     process = start(out)

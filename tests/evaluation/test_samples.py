@@ -64,6 +64,7 @@ def test_rows_are_those_of_an_independent_computation(drawn, data):
     assert rows["model"]["energy_score"].value == pytest.approx(away - np.mean(apart) / 2, rel=1e-4)
 
 
+@pytest.mark.ci
 def test_the_first_draw_is_the_only_one_of_a_single_sample(drawn, data, tmp_path):
     """Metrics of draws that are listed do not change a result without draws by a bit."""
     runs = {

@@ -37,6 +37,7 @@ def simulated(monkeypatch):
     return seen
 
 
+@pytest.mark.ci
 def test_another_model_is_evaluated_on_what_was_simulated_for_the_first(
     data, kept, simulated, tmp_path
 ):

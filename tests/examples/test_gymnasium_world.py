@@ -16,6 +16,7 @@ from acwm_scene.declared import default_states, groups_of
 from tests.examples.gymnasium_reacher import CARD, GymnasiumReacher
 
 
+@pytest.mark.ci
 def test_it_conforms_and_what_it_declares_is_true():
     results = list(check_environment(GymnasiumReacher))
     assert [str(result) for result in results if not result.passed] == []

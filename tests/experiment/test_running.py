@@ -107,6 +107,7 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
     assert not list((made / "logs").glob("*.state"))
 
 
+@pytest.mark.ci
 def test_a_failed_run_is_told_and_tried_again(acwm, whole, tmp_path):
     """That it stops no other is what test_local proves; here the other one is done."""
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)

@@ -114,6 +114,7 @@ def imported(folder, out, *words):
     return " ".join(done.output.split()), DatasetCard.read(out)
 
 
+@pytest.mark.ci
 def test_velocities_that_are_held_are_asked_about(tmp_path):
     takes = film(tmp_path / "takes", "velocity")
     said, card = imported(takes, tmp_path / "held")
@@ -147,6 +148,7 @@ def test_targets_that_are_held_are_asked_about_too(tmp_path):
     assert "velocities or forces" not in said
 
 
+@pytest.mark.ci
 def test_frames_that_are_left_out_leave_out_actions(tmp_path):
     takes = film(tmp_path / "takes", "velocity", per_frame=1)
     assert "times per frame" not in imported(takes, tmp_path / "all")[0]

@@ -64,6 +64,7 @@ def test_info_check_and_preview_know_it(imported, tmp_path):
     assert (tmp_path / "preview.png").stat().st_size > 1000
 
 
+@pytest.mark.ci
 def test_training_evaluating_and_reporting(imported, tmp_path):
     folder = tmp_path / "run"
     run("fit", "small", f"data.path={imported}", "--out", folder, *QUICK, "model.channels=8")

@@ -154,6 +154,7 @@ def test_a_small_dataset_has_a_report_too(tmp_path):
     assert write_data_report(found, tmp_path / "page.html").exists()
 
 
+@pytest.mark.ci
 def test_the_page_and_the_command(tmp_path, monkeypatch):
     data = written(tmp_path / "data", [blob(n) for n in range(6)], [blob(9)])
     done = CliRunner().invoke(main, ["data", "report", str(data)])

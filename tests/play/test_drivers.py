@@ -99,6 +99,7 @@ def test_when_one_fails_the_person_drives(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_a_pause_lets_it_think_and_a_step_takes_its_actions(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)

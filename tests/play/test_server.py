@@ -97,6 +97,7 @@ def middle(mask):
     return np.array([columns.mean(), rows.mean()]) if len(rows) else np.array([np.nan, np.nan])
 
 
+@pytest.mark.ci
 def test_both_pictures_follow_the_same_actions(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=3)
@@ -273,6 +274,7 @@ def test_tabs_are_bounded_and_nonsense_ends_one_alone(pool, tmp_path, monkeypatc
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_a_simulator_that_is_killed_is_started_again(pool, tmp_path):
     async def story(page, client):
         import multiprocessing

@@ -104,6 +104,7 @@ def evaluated(experiment):
     return [run for cell in experiment.cells for run in cell.runs if run.is_dir()]
 
 
+@pytest.mark.ci
 def test_names_lead_to_the_first_run_of_their_row(experiment, tmp_path):
     runs = evaluated(experiment)
     page = write_report(runs, tmp_path / "page.html", experiment=experiment).read_text()

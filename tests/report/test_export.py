@@ -109,6 +109,7 @@ def test_latex_compiles(exported, tmp_path):
     assert done.returncode == 0, done.stdout[-2000:]
 
 
+@pytest.mark.ci
 def test_every_figure_is_there_as_png_and_pdf(exported):
     _, out = exported
     pictures = {path.stem for path in (out / "figures").glob("*.png")}
@@ -142,6 +143,7 @@ def test_hard_words_survive_every_format(tmp_path):
         assert subprocess.run(command, cwd=tmp_path, capture_output=True).returncode == 0
 
 
+@pytest.mark.ci
 def test_several_runs_lie_in_folders_of_their_own(tmp_path):
     scores = np.linspace(20, 26, 6)
     runs = [synthetic.run(tmp_path / n, synthetic.clips(scores + i)) for i, n in enumerate("ab")]

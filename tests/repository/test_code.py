@@ -34,6 +34,7 @@ def sources():
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in CODE}
 
 
+@pytest.mark.ci
 def test_functions_are_short(sources):
     found = {
         f"{name}:{f.name}": body_lines(f) for name, text in sources.items() for f in functions(text)
@@ -41,6 +42,7 @@ def test_functions_are_short(sources):
     assert {name: n for name, n in found.items() if n > FUNCTION_LINES} == {}
 
 
+@pytest.mark.ci
 def test_text_has_an_encoding(sources):
     """Without one, what is read and written depends on the user's locale."""
     bare = []

@@ -133,6 +133,7 @@ def trained(objective, steps=500):
     return model.requires_grad_(False)
 
 
+@pytest.mark.ci
 def test_after_training_one_step_samples_what_sixteen_of_the_flow_do():
     """In one step, flow matching alone ends at the mean, and its samples have no spread."""
     plain = DiffusionForcing(shift=1, prediction="clean", loss_on="clean", weighting="none")

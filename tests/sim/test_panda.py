@@ -154,6 +154,7 @@ def psnr(squares):
     return -10 * np.log10(squares.mean() / 255**2)
 
 
+@pytest.mark.ci
 def test_the_decimated_arm_looks_like_the_full_one(world):
     decimate_panda = pytest.importorskip("acwm_sim.decimate_panda")
     whole = {name: decimate_panda.decimated(name, 1.0) for name in MESHES}

@@ -102,6 +102,7 @@ def test_a_killed_run_resumes_with_the_same_points(data, tmp_path, monkeypatch):
     assert_same(whole, run)
 
 
+@pytest.mark.ci
 def test_the_scale_of_growing_data_is_that_of_the_start(data, tmp_path, monkeypatch):
     """A run that was killed goes on with the scale that it began with, whatever data came since."""
     grown = {"data": {**PLACES, "growing": True, "validation_episodes": 2}}
@@ -127,6 +128,7 @@ def test_weights_keep_what_their_numbers_mean_on_other_data(data, tmp_path, monk
     torch.testing.assert_close(kept, scale)
 
 
+@pytest.mark.ci
 def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
     """Positions go on by the actions: a second of steps without pictures finds out how."""
 
@@ -157,6 +159,7 @@ def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
         torch.testing.assert_close(value, weights(longer)[name], rtol=0, atol=0)
 
 
+@pytest.mark.ci
 def test_predicted_states_are_those_of_the_card(data, tmp_path):
     """By name, of every video frame after the given one, in pixels of the tiny world."""
     run = fit(tiny_recipe(data, **learner(300, trainer={"max_steps": 100})), tmp_path / "run")

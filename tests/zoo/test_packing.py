@@ -257,6 +257,7 @@ def test_a_file_of_the_codec_ships_with_it(run, data, tmp_path):
     assert video.isfinite().all()
 
 
+@pytest.mark.ci
 def test_a_codec_with_the_same_latents_takes_the_place_of_the_old_one(data, tmp_path):
     """A run on `compact` ships with the decoder that sees the given frame; no other codec does."""
     parts = {
