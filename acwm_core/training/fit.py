@@ -128,7 +128,6 @@ def _train(
     kind = GrowingClipData if clips.growing else ClipData
     data = kind(clips, episodes, world_model.codec, config.seed)
     module = TrainingModule(world_model, config, resumed=checkpoint is not None)
-    preemption = Preemption(run)
     before = Recipe.from_yaml(run.recipe) if checkpoint else None
     schedule = ResumedSchedule(before.trainer.get("max_steps", -1) if before else None)
     flags = recipe.trainer
@@ -140,7 +139,7 @@ def _train(
         flags,
         config,
         [
-            preemption,
+            preemption := Preemption(run),
             callbacks.CpuTime(start),
             RecordedPrecision(),
             schedule,
