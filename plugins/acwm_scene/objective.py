@@ -89,7 +89,6 @@ class SceneObjective(Regression):
             states = batch.latents.new_zeros(
                 len(batch.latents), 1 + (batch.latents.shape[1] - 1) * model.stride, 0
             )
-        states = model.with_points(states, batch.latents)
         frames = batch.latents.shape[1]
         numbers = self.compared_frames(model, batch, known)
         if numbers is None:
@@ -97,6 +96,9 @@ class SceneObjective(Regression):
             numbers = torch.arange(count, device=batch.latents.device).expand(
                 len(batch.latents), -1
             )
+        given = torch.arange(known, device=numbers.device).expand(len(numbers), -1)
+        shown = torch.cat([given, known + numbers], 1) if self.motion_steps else None
+        states = model.with_points(states, batch.latents, shown)
         drawn = model.draw_true(batch.latents[:, :known], states, numbers)
         pictures = functional.mse_loss(drawn.float(), frames_of(batch, known, numbers).float())
         read = batch.random_frames(min(READ_FRAMES, frames) - 1, frames - 1) + 1

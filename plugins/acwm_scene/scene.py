@@ -293,21 +293,28 @@ class SceneDynamics(Predictor):
         """The points that it finds by itself, if it does."""
         return dict(self._groups()).get("points")  # pyright: ignore[reportReturnType]
 
-    def with_points(self, states: Tensor, latents: Latent) -> Tensor:
-        """States `[B, T, S]`, and after them the points that it reads from all latents.
+    def with_points(self, states: Tensor, latents: Latent, frames: Tensor | None = None) -> Tensor:
+        """States `[B, T, S]`, and after them the points that it reads from latents.
 
         Args:
             states: as they were recorded; S may be 0.
             latents: of the clips, `[B, L, C, h, w]`.
+            frames: numbers of the latent frames to read, `[B, N]`; the points of others are then 0.
+                All by default.
 
         Returns:
             `[B, T, S + point_size]`; all video frames of a latent frame have its points.
         """
         if self.points is None:
             return states
-        read = self.points.sight(latents.flatten(0, 1)).flatten(1)
-        read = read.unflatten(0, latents.shape[:2]).repeat_interleave(self.stride, 1)
-        return torch.cat([states, read[:, self.stride - 1 :]], 2)
+        if frames is None:
+            frames = torch.arange(latents.shape[1], device=latents.device).expand(len(latents), -1)
+        shown = latents.take_along_dim(frames[..., None, None, None], 1)
+        read = self.points.sight(shown.flatten(0, 1)).flatten(1).unflatten(0, frames.shape)
+        whole = read.new_zeros(*latents.shape[:2], self.point_size)
+        whole = whole.scatter(1, frames[..., None].expand_as(read), read)
+        whole = whole.repeat_interleave(self.stride, 1)[:, self.stride - 1 :]
+        return torch.cat([states, whole], 2)
 
     def encode(self, states: Tensor) -> dict[str, Any]:
         """The courses in states `[B, T, S]`, as they were recorded, by group.
