@@ -47,7 +47,7 @@ class DataConfig:
             tenth by default, at most 32.
         states: fields of the state that the model learns to predict too, so that it knows where the
             agent is: what a robot knows of itself, e.g. ``[joint_position]``. Rollouts are given
-            none. By default those that the model chooses; ``[]`` for none.
+            none. By default those that the model chooses.
         symmetries: train on each clip also as the symmetries on the card of the data transform it:
             push_cube, which has seven, gives eight times as many clips. Validation does not.
         growing: train on the episodes that a running `acwm generate` has finished, and look for
@@ -69,7 +69,7 @@ class DataConfig:
     window_stride: PositiveInt = 4
     fraction: Annotated[float, Gt(0), Le(1)] = 1.0
     validation_episodes: NonNegativeInt | None = None
-    states: tuple[str, ...] | None = None
+    states: tuple[str, ...] = ()
     symmetries: bool = False
     growing: bool = False
     cache_latents: bool = True

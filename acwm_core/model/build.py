@@ -46,7 +46,7 @@ def build_world_model(recipe: Recipe, card: EnvironmentCard | CardOfData) -> Wor
     card = card if isinstance(card, EnvironmentCard) else card.environment
     codec = build_codec(recipe.codec)
     objective = build_objective(recipe.objective)
-    states = state_shapes(recipe.data.get("states") or (), card)
+    states = state_shapes(recipe.data.get("states", ()), card)
     inputs = ModelInputs(codec.channels, codec.temporal_stride, card, tuple(states))
     model = build_model(recipe.model, objective, inputs)
     conditioner = build_conditioner(

@@ -80,13 +80,14 @@ class DynamicsModel(nn.Module, ABC):
 
     @classmethod
     def default_states(
-        cls, environment: EnvironmentCard, changing: Collection[str]
+        cls, environment: EnvironmentCard, changing: Collection[str], **parameters: Any
     ) -> tuple[str, ...]:
         """The fields of the state to learn where a recipe names none; none by default.
 
         Args:
             environment: the card of the environment that the data shows.
             changing: names of the fields that change within episodes.
+            **parameters: of the model, as the recipe sets them.
         """
         return ()
 

@@ -56,7 +56,7 @@ class ClipData(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
-        self.states = config.states or ()
+        self.states = config.states
         self._split = self._divided()
         self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
         self._check_states()

@@ -207,18 +207,16 @@ def _check_meaning(config: TrainingConfig, card: EnvironmentCard) -> None:
 
 
 def _with_states(recipe: Recipe, episodes: EpisodeDataset) -> Recipe:
-    """The recipe with the fields of the state that its model learns by default if it names none."""
-    if recipe.data.get("states") is not None:
-        return recipe
+    """The recipe with the fields of the state that its model learns if it names none."""
     model = catalog().component("model", recipe.model.name).load()
     choose = getattr(model, "default_states", DynamicsModel.default_states)
+    if recipe.data.get("states") or choose.__func__ is DynamicsModel.default_states.__func__:
+        return recipe
     card = episodes.card.environment
-    chosen = list[str]()
-    if choose.__func__ is not DynamicsModel.default_states.__func__:
-        names = [each.name for each in card.state]
-        changing = [name for name in names if np.ptp(episodes.states(0, [name]), 0).any()]
-        chosen = [*choose(card, changing)]
-    return replace(recipe, data={**recipe.data, "states": chosen})
+    names = [each.name for each in card.state]
+    changing = [name for name in names if np.ptp(episodes.states(0, [name]), 0).any()]
+    chosen = choose(card, changing, **recipe.model.params)
+    return replace(recipe, data={**recipe.data, "states": [*chosen]})
 
 
 def _start_from(

@@ -136,9 +136,19 @@ class SceneDynamics(Predictor):
 
     @classmethod
     def default_states(
-        cls, environment: EnvironmentCard, changing: Collection[str]
+        cls,
+        environment: EnvironmentCard,
+        changing: Collection[str],
+        *,
+        points: int = 0,
+        **parameters: Any,
     ) -> tuple[str, ...]:
-        """What moves, as the card declares it; see `acwm_scene.declared.default_states`."""
+        """What moves, as the card declares it; none if the scene finds points by itself.
+
+        See `acwm_scene.declared.default_states`.
+        """
+        if points:
+            return ()
         return default_states(environment, changing)
 
     def upgrade(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:

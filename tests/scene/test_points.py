@@ -7,6 +7,7 @@ import torch
 
 from acwm_core.checks import check_model
 from acwm_core.errors import RecipeError
+from acwm_core.plugins import catalog
 from acwm_scene.declared import GroupSpec
 from acwm_scene.point_sight import PointSight
 from acwm_scene.point_training import learn_points, states_with_points
@@ -102,6 +103,13 @@ def test_actions_move_them(learnt):
     moved = follow(learnt, true, actions)["points"].flatten(2)
     error, still = ((each[:, -1] - true[:, -1]).square().mean() for each in (moved, true[:, :1]))
     assert error < 0.3 * still
+
+
+def test_declared_states_are_learnt_beside_points_if_they_are_named():
+    card = catalog().component("environment", "push_cube").load().card
+    changing = [field.name for field in card.state]
+    assert SceneDynamics.default_states(card, changing)
+    assert SceneDynamics.default_states(card, changing, points=4) == ()
 
 
 def test_declared_states_keep_their_columns():

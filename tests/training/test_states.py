@@ -93,7 +93,7 @@ def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkey
 def test_a_killed_run_resumes_with_the_same_points(data, tmp_path, monkeypatch):
     """Points and their motion were learnt before the first picture, and are not learnt again."""
     objective = {"name": "scene", "point_steps": 3, "motion_steps": 3}
-    asked = {"model": {**SCENE, "points": 2}, "objective": objective, "data": {"states": []}}
+    asked = {"model": {**SCENE, "points": 2}, "objective": objective}
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
     monkeypatch.setattr(Kill, "batch", 7)
     run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
