@@ -12,6 +12,7 @@ from acwm_benchmark.score import score_predictions
 PAGE = Path(__file__).parents[2] / "docs" / "enter.md"
 
 
+@pytest.mark.ci
 def test_the_page_is_short_and_its_program_enters(tasks, truth, tmp_path):
     text = PAGE.read_text()
     assert len(text.splitlines()) <= 60

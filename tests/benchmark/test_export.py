@@ -112,6 +112,7 @@ def test_the_public_set_can_be_simulated_by_anyone_and_a_secret_one_cannot(parts
     assert not [path for path in written if str(SEED) in path.read_text()]
 
 
+@pytest.mark.ci
 def test_clips_of_the_published_release_are_scored_by_its_protocol(parts, tmp_path):
     home = tmp_path / "push_block"
     splits = {"ind_train": 1, "ind_test": 3, "ood_test": 2}

@@ -51,6 +51,7 @@ def test_a_report_is_made_of_scores(home, tmp_path):
     assert "another episode’s actions" not in words.partition("Scores")[0]
 
 
+@pytest.mark.ci
 def test_scores_and_a_run_are_compared_in_one_report_and_one_table(home, tmp_path):
     both = home / "run", home / "squares/slide"
     _, words = page_of("report", *both, out=tmp_path / "report.html")

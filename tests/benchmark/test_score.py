@@ -84,6 +84,7 @@ def rms(summary, split, row):
 
 
 @pytest.mark.parametrize("kind", ["mp4", pytest.param("webm", marks=pytest.mark.ci)])
+@pytest.mark.ci
 def test_lossy_video_differs_by_less_than_what_is_told(kind, run, tasks, truth, scored, tmp_path):
     predictions = predict(run, tasks, tmp_path / kind, kind)
     lossy = score(predictions, tasks, truth, tmp_path / "scores")

@@ -70,6 +70,7 @@ def test_installed_environments_conform(part, monkeypatch, tmp_path):
     assert_same(read, suite.episode)
 
 
+@pytest.mark.ci
 def test_a_sound_environment_passes_every_check():
     results = list(check_environment(Disc))
     assert [result.name for result in results] == [in_words(check) for check in CHECKS]

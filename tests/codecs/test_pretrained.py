@@ -299,6 +299,7 @@ def test_a_recipe_takes_them_by_a_word(folders, name):
     assert video.shape == (1, 6, 3, 32, 32)
 
 
+@pytest.mark.ci
 def test_the_conformance_suite_takes_weights_by_a_word(folders):
     run = CliRunner().invoke(main, ["check", "wan", f"codec.weights={folders['wan']}"])
     assert run.exit_code == 0, run.output

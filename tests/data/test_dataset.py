@@ -38,6 +38,7 @@ def test_every_episode_is_its_specs(square_data):
             np.testing.assert_array_equal(part, truth.video[4:9].transpose(0, 3, 1, 2))
 
 
+@pytest.mark.ci
 def test_indices_behave_like_a_lists(square_data):
     dataset = EpisodeDataset(square_data, "train")
     assert dataset[-1].spec.index == 10

@@ -52,6 +52,7 @@ def test_disks_of_many_sizes(whole, tmp_path):
     assert any(name.endswith(".tar") for disk in full for name in disk["half"])
 
 
+@pytest.mark.ci
 def test_files_that_may_not_grow(whole, tmp_path):
     """The same where a quota, not the disk, is the limit; with workers."""
     out = tmp_path / "data"

@@ -61,6 +61,7 @@ def alive(pid):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="watches processes in /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.ci
 def test_a_killed_command_goes_on_where_it_ended(tmp_path, uninterrupted, how):
     out = tmp_path / "data"
     process = start(out)

@@ -28,6 +28,7 @@ def stream(data, count):
     ("ranks", "workers"),
     [(2, 0), *(pytest.param(*more, marks=pytest.mark.slow) for more in [(2, 2), (4, 0)])],
 )
+@pytest.mark.ci
 def test_ranks_take_equal_steps_whatever_the_shards(ranks, workers, square_data, tmp_path):
     """Three shards on 2 ranks × 2 workers, and more ranks than shards.
 

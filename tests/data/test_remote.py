@@ -100,6 +100,7 @@ def test_lasting_failures_end_with_a_sentence_and_leave_nothing(fault, message, 
     assert episodes.video(5).any()
 
 
+@pytest.mark.ci
 def test_processes_that_want_the_same_shard_fetch_it_once(server, square_data):
     server.faults = {SHARDS[1]: ["slow"]}
     readers = [start_reader(server.url) for _ in range(3)]

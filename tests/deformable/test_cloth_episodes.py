@@ -41,6 +41,7 @@ def parted():
 
 
 @pytest.mark.parametrize("variant", ["shared", "parted"])
+@pytest.mark.ci
 def test_edges_stay_within_five_percent_under_push_and_pull(variant, request):
     """But for single edges of cloth that two free arms wedge between themselves and the sphere."""
     strains = np.array(request.getfixturevalue(variant)[1].strains)

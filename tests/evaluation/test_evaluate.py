@@ -101,6 +101,7 @@ def test_the_batch_size_changes_nothing(evaluated, data, tmp_path):
             np.testing.assert_allclose(a.curves["mse"], b.curves["mse"], rtol=1e-5, atol=1e-10)
 
 
+@pytest.mark.ci
 def test_a_second_evaluation_repeats_the_first(evaluated, data, tmp_path):
     run = tiny.make_run(tmp_path / "again", data, **tiny.SWEEP)
     evaluate_run(run, progress=False)

@@ -27,6 +27,7 @@ FEW += ("perturbed_episodes=0", "noise_floor_episodes=0", "ensemble_episodes=0",
         ("second_release/run", 2),
     ],
 )
+@pytest.mark.ci
 def test_a_run_gets_the_same_scores(run, samples, tmp_path):
     release, name = run.split("/")
     for folder in ("data", name):

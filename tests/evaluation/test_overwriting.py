@@ -82,6 +82,7 @@ def test_overwriting_is_asked_for(run):
     assert Summary.read(run).provenance["evaluation"]["steps"] == 1
 
 
+@pytest.mark.ci
 def test_another_folder_is_reported_and_compared_like_a_run(run, tmp_path):
     other = tmp_path / "one-step"
     words = ["evaluate", str(run), "evaluation.steps=1", "--out", str(other)]
@@ -126,6 +127,7 @@ def test_two_evaluations_at_once_are_refused(run, monkeypatch):
         evaluate_run(run, progress=False)
 
 
+@pytest.mark.ci
 def test_a_result_that_is_replaced_is_the_old_or_the_new_one_at_every_moment(data, tmp_path):
     """Summary, scores and videos, read by others before and after every file is renamed."""
     run = tiny.make_run(tmp_path / "run", data, **FAST | {"videos": 1})

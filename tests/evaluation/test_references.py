@@ -113,6 +113,7 @@ def test_data_that_claim_the_checksums_of_others_have_rows_of_their_own(own, tmp
     assert still[0] != still[1]
 
 
+@pytest.mark.ci
 def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     folder, run, _ = own
     _, evaluator = open_run(RunFolder(run), [])

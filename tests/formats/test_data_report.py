@@ -192,6 +192,7 @@ def test_measured_needs_become_a_table(tmp_path, monkeypatch):
     assert [row.title for row in table.rows] == ["32", "2,048"]
 
 
+@pytest.mark.ci
 def test_episodes_that_cannot_be_read_do_not_end_the_report(tmp_path):
     data = written(tmp_path / "data", [blob(n) for n in range(4)], [blob(5), blob(6)])
     damage_episode(data, "train", 1)

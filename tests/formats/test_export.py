@@ -52,6 +52,7 @@ def lerobot(simulated, tmp_path_factory):
     return export(simulated, tmp_path_factory.mktemp("exports") / "lerobot", LeRobot())
 
 
+@pytest.mark.ci
 def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
     export(simulated, tmp_path / "out", Published())
     for split, folder in (("train", "ind_train"), ("ind_test", "ind_test"), ("ood_test",) * 2):
@@ -72,6 +73,7 @@ def test_the_published_layout_holds_the_dataset(simulated, tmp_path):
             assert looks_like(decoded(video), episode.video)
 
 
+@pytest.mark.ci
 def test_the_published_layout_comes_back(simulated, tmp_path):
     export(simulated, tmp_path / "out", Published())
     recorded = Published().read(tmp_path / "out/rigid_dynamics/push_block")
@@ -108,6 +110,7 @@ def test_hdf5_keeps_every_bit(simulated, tmp_path):
                 assert json.loads(group.attrs["spec"]) == episode.spec.to_dict()
 
 
+@pytest.mark.ci
 def test_hdf5_comes_back_whole(simulated, tmp_path):
     recorded = HDF5().read(export(simulated, tmp_path / "out", HDF5()))
     card = imported(recorded, tmp_path / "back")
@@ -275,6 +278,7 @@ def test_exports_are_whole_or_not_there(simulated, tmp_path):
         export(tmp_path / "nowhere", tmp_path / "other", HDF5())
 
 
+@pytest.mark.ci
 def test_a_killed_export_leaves_nothing_under_its_name(simulated, tmp_path):
     out = tmp_path / "out"
     code = """

@@ -17,6 +17,7 @@ def checked(monkeypatch):
     return lambda *words: [(name == TRUE, name, seen) for name, seen in checked(*words)]
 
 
+@pytest.mark.ci
 def test_cubes_that_are_deleted_added_doubled_split_or_merged_are_found(checked):
     found = checked("push_cube", 2, 64, 15)
     assert len({name for _, name, _ in found}) == 6
@@ -34,6 +35,7 @@ def test_cubes_that_are_deleted_added_doubled_split_or_merged_are_found(checked)
         pytest.param("pour_water", 90, "amount of water", marks=pytest.mark.ci),
     ],
 )
+@pytest.mark.ci
 def test_faults_break_the_law_that_they_should_and_true_videos_none(
     checked, world, frames, violation
 ):

@@ -55,6 +55,7 @@ def test_a_driver_gets_the_goal_of_the_scene_and_solves_it(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_it_stops_at_once_when_the_person_takes_over_or_asks_for_a_scene(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=5)

@@ -124,6 +124,7 @@ def test_both_pictures_follow_the_same_actions(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_the_model_takes_the_simulators_state_over(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=5)
@@ -169,6 +170,7 @@ def test_scenes_come_again_and_factors_shift_them(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_pausing_stepping_and_the_policy(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=2)
@@ -193,6 +195,7 @@ def test_pausing_stepping_and_the_policy(pool, tmp_path):
     played(pool, tmp_path, story)
 
 
+@pytest.mark.ci
 def test_a_session_becomes_episodes_that_the_check_accepts(pool, tmp_path):
     async def story(page, client):
         await page.say("open", index=2)

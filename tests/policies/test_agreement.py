@@ -54,6 +54,7 @@ def test_what_is_constant_has_no_correlation():
     assert (alone.spearman.value, alone.optimism.value, alone.optimism.low) == (None, 1, None)
 
 
+@pytest.mark.ci
 def test_intervals_cover_policies_and_episodes():
     intervals = functools.partial(agreement, resamples=200)
     skill = np.linspace(0, 1, 12)[:, None]

@@ -74,6 +74,7 @@ def test_episodes_that_no_picture_tells_are_counted(mine, first, second, told):
     assert told is None or f"The estimator found no distance {told}" in table.caption
 
 
+@pytest.mark.ci
 def test_one_of_other_weights_or_none_is_not(mine):
     run = EvaluatedRun.read(mine, "run1")
     assert ranking_tables(run) == []

@@ -71,6 +71,7 @@ def test_contacts_agree_with_the_distances(unseen):
                 assert gap > 0.04 + 0.03 - 2e-3
 
 
+@pytest.mark.ci
 def test_policy_touches_cubes_in_most_episodes_and_keeps_moving(unseen):
     touched, steps, moved, headings = 0, [], [], []
     for index in range(20):

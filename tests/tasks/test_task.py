@@ -114,6 +114,7 @@ def touchy(*goals):
     return TaskEnvironment(catalog().create("environment", "reacher", size=64), Touchy(goals))
 
 
+@pytest.mark.ci
 def test_goals_that_are_reached_at_the_start_are_drawn_again(reacher):
     tip = float(begin(reacher)[1]["state"]["fingertip_position"][0])
     env = touchy(tip, tip + 0.1, tip + 3.0)

@@ -59,6 +59,7 @@ def training(parts, *, compiled=True, **config):
 
 
 @pytest.mark.parametrize("parts", combinations())
+@pytest.mark.ci
 def test_a_model_is_compiled_once_and_in_one_piece(parts):
     """For all of 20 steps, whatever their noise; but shortcut forcing also evaluates some clips."""
     step = training(parts)

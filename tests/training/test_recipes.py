@@ -98,6 +98,7 @@ def test_two_real_steps(recipe, words, data_of, tmp_path):
     takes_two_steps(recipe, (*words, *motion, *fewer), data_of(world, states), tmp_path)
 
 
+@pytest.mark.ci
 def test_a_scene_learns_what_its_card_declares(data_of, tmp_path):
     words = ("+small", "+scene", "codec=compact_reference", "objective.motion_steps=2")
     run = takes_two_steps("push_cube", words, data_of("push_cube", True), tmp_path)

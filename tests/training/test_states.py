@@ -81,6 +81,7 @@ def test_what_moves_by_rounding_alone_is_not_magnified(data, monkeypatch):
 
 
 @pytest.mark.parametrize("steps", [0, 3])
+@pytest.mark.ci
 def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkeypatch):
     asked = learner(steps)
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
@@ -90,6 +91,7 @@ def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkey
     assert_same(whole, run)
 
 
+@pytest.mark.ci
 def test_a_killed_run_resumes_with_the_same_points(data, tmp_path, monkeypatch):
     """Points and their motion were learnt before the first picture, and are not learnt again."""
     objective = {"name": "scene", "point_steps": 3, "motion_steps": 3}

@@ -129,6 +129,7 @@ USUAL = ("report", "hdf5")
     "name",
     [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in COMMANDS],
 )
+@pytest.mark.ci
 def test_disks_of_many_sizes(name, request, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
