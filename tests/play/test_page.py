@@ -158,7 +158,7 @@ def test_another_page_may_not_play(browser, served):
 
 def test_another_world_is_chosen_in_the_menu(page):
     page.locator("#world").select_option("reacher")
-    until(page, "document.getElementById('how').textContent.includes('like a stick')")
+    until(page, "document.getElementById('how').textContent.includes('joystick')")
     page.keyboard.press("b")
     until(page, "Number(document.body.dataset.alone) > 0.5")
     assert "forearm mass" in page.inner_text("#factors").lower()
