@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,13 +20,27 @@ if TYPE_CHECKING:
     from acwm_core.env.episode import Split
     from acwm_core.recipe import Recipe
 
-TRAINING: Mapping[Split, int] = {"train": 1280}
+EPISODES = 1280
+"""Episodes to train on."""
+
 TESTS: Mapping[Split, int] = {"ind_test": 32, "ood_test": 32}
-QUICK_TRAINING: Mapping[Split, int] = {"train": 16}
 QUICK_TESTS: Mapping[Split, int] = {"ind_test": 4, "ood_test": 4}
+
+SECONDS = 690
+"""How long it should take: on a machine that is slower than the one of `Step` it is smaller."""
+
+SIZES = (1.0, 0.75, 0.5, 0.35)
+"""Shares of the episodes and of the training steps that it may have."""
+
+SIZE = "size.json"
+"""File that keeps the share, so that a continued demo goes on as it began."""
 
 ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 """Settings of the evaluation that the shipped model takes from the demo."""
+
+
+SIMULATING, TRAINING, CLOSING = 90, 290, 44
+"""Seconds of simulating the training episodes, of the training, and of what follows; see `Step`."""
 
 
 class Step(NamedTuple):
@@ -34,7 +48,7 @@ class Step(NamedTuple):
 
     Attributes:
         what: what it does, for the terminal.
-        seconds: how long it takes on two idle cores.
+        seconds: how long it takes on two idle cores with AVX-512.
         work: does it, unless it is already done; returns whether it did.
     """
 
@@ -51,19 +65,20 @@ def demo(out: Path | None, quick: bool) -> None:
 
     Takes about ten minutes on two CPU cores: compares the trained model that ships with the
     simulator, then simulates a small dataset, trains a world model, evaluates it and adds it to
-    the report in runs/demo (with --quick, runs/demo_quick). If it is interrupted, run the same
-    command again to continue.
+    the report in runs/demo (with --quick, runs/demo_quick). On a slow machine it simulates less
+    and trains for fewer steps. If it is interrupted, run the same command again to continue.
     """
+    from acwm_core.evaluation.results import Summary
     from acwm_core.recipe import compose
     from acwm_report.page import write_report
 
     catalog().component("command", "report")  # says so now if it is missing
     folder = out or Path("runs", "demo_quick" if quick else "demo")
-    training, tests = (QUICK_TRAINING, QUICK_TESTS) if quick else (TRAINING, TESTS)
+    tests = QUICK_TESTS if quick else TESTS
     data, run, shipped, report = (folder / n for n in ("data", "run", "shipped", "report.html"))
     rehearsal = ["+quick", "objective.motion_steps=5"] if quick else []
     recipe = compose("demo", [*rehearsal, f"data.path={data}"])
-    episodes, held_out = sum(training.values()), sum(tests.values())
+    held_out = sum(tests.values())
 
     def first_page() -> bool:
         if report.exists():
@@ -76,36 +91,91 @@ def demo(out: Path | None, quick: bool) -> None:
         write_report([run, shipped], report)
         return True
 
-    steps = recipe.trainer["max_steps"]
-    _work_through(
+    progress = Progress(7)
+    opening = (
         Step(f"simulating {held_out} test episodes", 12, lambda: _generate(recipe, data, tests)),
         Step("predicting them by the model that ships", 65, lambda: _shipped(recipe, shipped)),
         Step("writing the first report", 2, first_page),
-        Step(f"simulating {episodes} episodes", 90, lambda: _generate(recipe, data, training)),
-        Step(f"training for {steps} steps", 290, lambda: _fit(recipe, run)),
-        Step("predicting the test episodes", 40, lambda: _evaluate(run)),
+    )
+    progress.work(opening, later=SIMULATING + TRAINING + CLOSING)
+    share = 1.0 if quick else share_of_time(folder, progress)
+    training: Mapping[Split, int] = {"train": 16 if quick else round(share * EPISODES)}
+    if share < 1:
+        recipe = compose("demo", [f"data.path={data}", *fewer_steps(recipe, share)])
+    what = f"simulating {training['train']} episodes"
+    steps = recipe.trainer["max_steps"]
+    closing = (
+        Step(what, SIMULATING * share, lambda: _generate(recipe, data, training)),
+        Step(f"training for {steps} steps", TRAINING * share, lambda: _fit(recipe, run)),
+        Step("predicting the test episodes", CLOSING - 4, lambda: _evaluate(run)),
         Step("writing the report", 4, both),
     )
-    from acwm_core.evaluation.results import Summary
-
+    progress.work(closing)
     print_summary(Summary.read(run))
     click.echo(f"report: {report}")
 
 
-def _work_through(*steps: Step) -> None:
-    """Do the steps in order, and say before each about how long all that are left will take."""
-    spent = expected = 0.0
-    for number, step in enumerate(steps):
-        pace = spent / expected if expected else 1.0
-        minutes = max(1, round(pace * sum(each.seconds for each in steps[number:]) / 60))
-        place = f"[{number + 1}/{len(steps)}]"
-        click.echo(f"{place} {step.what}; about {minutes} min left", err=True)
-        started = time.monotonic()
-        done = step.work()
-        seconds = time.monotonic() - started
-        click.echo(f"{place} {f'took {seconds:.0f} s' if done else 'already done'}", err=True)
-        if done:
-            spent, expected = spent + seconds, expected + step.seconds
+class Progress:
+    """Works through steps, and says before each about how long all that are left will take.
+
+    Attributes:
+        spent: seconds that steps took so far.
+        expected: seconds that these take on two idle cores with AVX-512.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number, self.finished = number, 0
+        self.spent = self.expected = 0.0
+
+    @property
+    def pace(self) -> float:
+        """How many times as long as on two idle cores with AVX-512 it takes."""
+        return self.spent / self.expected if self.expected else 1.0
+
+    def work(self, steps: Sequence[Step], later: float = 0) -> None:
+        """Do steps in order; others that follow later are expected to take so many seconds."""
+        for number, step in enumerate(steps):
+            seconds = self.pace * (later + sum(each.seconds for each in steps[number:]))
+            self.finished += 1
+            place = f"[{self.finished}/{self.number}]"
+            minutes = max(1, round(seconds / 60))
+            click.echo(f"{place} {step.what}; about {minutes} min left", err=True)
+            started = time.monotonic()
+            done = step.work()
+            seconds = time.monotonic() - started
+            click.echo(f"{place} {f'took {seconds:.0f} s' if done else 'already done'}", err=True)
+            if done:
+                self.spent += seconds
+                self.expected += step.seconds
+
+
+def share_of_time(folder: Path, progress: Progress) -> float:
+    """The share of the episodes and steps that this machine has the time for."""
+    kept = folder / SIZE
+    if kept.exists():
+        return float(json.loads(kept.read_text("utf-8"))["share"])
+    if (folder / "run").exists():  # begun by a version that knew no shares
+        return 1.0
+    left = SECONDS - progress.spent - progress.pace * CLOSING
+    affordable = left / (progress.pace * (SIMULATING + TRAINING))
+    share = next((each for each in SIZES if each <= affordable), SIZES[-1])
+    if share < 1:
+        click.echo(
+            f"this machine takes {progress.pace:.1f} times as long as two idle cores with AVX-512, "
+            f"so the demo has {share:.0%} of its episodes and steps",
+            err=True,
+        )
+    kept.write_text(json.dumps({"share": share}), "utf-8")
+    return share
+
+
+def fewer_steps(recipe: Recipe, share: float) -> list[str]:
+    """Overrides for a share of the steps."""
+    motion = recipe.objective.params["motion_steps"]
+    return [
+        f"objective.motion_steps={round(share * motion)}",
+        f"trainer.max_steps={round(share * recipe.trainer['max_steps'])}",
+    ]
 
 
 def _generate(recipe: Recipe, data: Path, episodes: Mapping[Split, int]) -> bool:

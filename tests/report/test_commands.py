@@ -62,7 +62,9 @@ def test_without_it_nothing_is_to_be_reported(without_the_plugin, tmp_path):
 
 def test_without_it_the_demo_says_so_before_it_works(without_the_plugin, monkeypatch, tmp_path):
     pytest.importorskip("acwm_zoo")
-    monkeypatch.setattr("acwm_zoo.demo._work_through", lambda *_: pytest.fail("it went to work"))
+    monkeypatch.setattr(
+        "acwm_zoo.demo.Progress.work", lambda *_, **__: pytest.fail("it went to work")
+    )
     ended = CliRunner().invoke(main, ["demo", "--out", str(tmp_path / "demo")])
     assert ended.exit_code == 2
     assert ended.stderr.startswith("acwm: unknown command 'report'")
