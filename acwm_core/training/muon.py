@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.optim import Muon
 
 RMS = 0.2
-"""Root mean square of an update, so that a learning rate of AdamW suits (arXiv 2502.16982)."""
+"""Root mean square of updates with ``adjust_lr_fn="match_rms_adamw"``, by which learning rates of
+AdamW suit (arXiv 2502.16982)."""
 
 
 class Float32Muon(Muon):
-    """`torch.optim.Muon` with ``adjust_lr_fn="match_rms_adamw"``, all of it in float32.
+    """`torch.optim.Muon`, all of it in float32.
 
     Without instructions for bfloat16, a CPU converts every value: on AVX2 the update of a matrix of
     96 × 864 takes 48 ms, and 5 ms in float32. State and groups are those of PyTorch's, so either
@@ -44,7 +45,10 @@ class Float32Muon(Muon):
         update = gradient.lerp(mean, momentum) if group["nesterov"] else mean
         update = orthogonal(update, group["ns_coefficients"], group["ns_steps"], group["eps"])
         weights.mul_(1 - group["lr"] * group["weight_decay"])
-        weights.add_(update, alpha=-RMS * math.sqrt(max(weights.shape)) * group["lr"])
+        rows, columns = weights.shape
+        matches_adamw = group["adjust_lr_fn"] == "match_rms_adamw"
+        scale = RMS**2 * max(rows, columns) if matches_adamw else max(1, rows / columns)
+        weights.add_(update, alpha=-group["lr"] * math.sqrt(scale))
 
 
 def orthogonal(

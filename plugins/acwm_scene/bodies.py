@@ -16,7 +16,7 @@ from acwm_scene.body_painter import BodyPainter
 from acwm_scene.body_sight import BodySight, pose_distance, pose_loss, sight_loss
 from acwm_scene.body_windows import moving_windows
 from acwm_scene.declared import GroupSpec, unit_of
-from acwm_scene.group import Group, at_frame, energy_score, stacked
+from acwm_scene.group import SteppedGroup, at_frame, energy_score, stacked
 from acwm_scene.nodes import View
 from acwm_scene.poses import Poses, angle_between, direction, turned_back
 
@@ -27,7 +27,7 @@ START_NOISE = 0.01
 """Noise on the true poses that motion is learned from, in units and rad."""
 
 
-class BodyGroup(Group):
+class BodyGroup(SteppedGroup):
     """Agents that the actions move, and bodies that they push about on a plane.
 
     It is for a camera that looks down on the plane, and bodies that keep their colours: number k is
@@ -126,7 +126,7 @@ class BodyGroup(Group):
         """Embedded actions by agents and video frames; see `AgentMotion.embed`."""
         return self.agent_motion.embed(modulation)
 
-    def move(self, state: Moving, action: Tensor) -> Moving:
+    def step(self, state: Moving, action: Tensor) -> Moving:
         """The agents follow the action, and push."""
         agents = state.poses.agents
         change, hidden = self.agent_motion(action, agents, state.agent_change, state.hidden)
@@ -169,7 +169,7 @@ class BodyGroup(Group):
 
     def _agent_loss(self, agents: Tensor, actions: Tensor, random: Generator) -> Tensor:
         chosen = torch.randperm(len(agents), generator=random)[:FOLLOWED].to(agents.device)
-        agents, actions = agents[chosen], actions[chosen]
+        agents, actions = agents[chosen], actions[chosen].flatten(1, 2)
         noise = to_device(torch.randn(agents[:, 0].shape, generator=random), agents)
         passed: list[Tensor] = []
         place = agents[:, 0] + START_NOISE * noise

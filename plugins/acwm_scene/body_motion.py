@@ -67,13 +67,13 @@ class AgentMotion(nn.Module):
         )
 
     def embed(self, modulation: Tensor) -> Tensor:
-        """Embedded actions `[B, L, width]` by agents and video frames, `[B, L stride, A, ACTION]`.
+        """Embedded actions `[B, L, width]` by agents and video frames, `[B, L, stride, A, ACTION]`.
 
         The first `stride` rows are of the first latent frame, which no action leads to.
         """
         with torch.autocast(modulation.device.type, enabled=False):  # errors of places add up
             actions = self.actions(modulation.float())
-        return actions.reshape(len(actions), -1, self.agents, ACTION)
+        return actions.unflatten(-1, (-1, self.agents, ACTION))
 
     def forward(
         self, action: Tensor, places: Tensor, change: Tensor, hidden: Tensor

@@ -100,20 +100,23 @@ class Group(nn.Module, ABC):
         return stacked([self.frame(state)] * frames)
 
     def with_draw(self, state: Any, draw: Tensor) -> Any:
-        """The state with the numbers `[B, noise]` that its future depends on."""
-        raise NotImplementedError
+        """The state with the numbers `[B, noise]` that its future depends on, as its `chance`."""
+        return state._replace(chance=(draw,))
 
     @abstractmethod
     def embed(self, modulation: Tensor) -> Tensor:
-        """Embedded actions `[B, L, width]` by video frames, `[B, L · stride, …]`."""
+        """Actions `[B, L, width]` as they move things, `[B, L, …]`; none moves the first one."""
 
     @abstractmethod
-    def move(self, state: Any, action: Tensor) -> Any:
-        """The state one video frame later.
+    def move(self, state: Any, actions: Tensor) -> tuple[Any, Any]:
+        """The state one latent frame later, and the course of its video frames.
 
         Args:
-            state: in the video frame before.
-            action: one of the rows of `embed`, `[B, …]`.
+            state: in the last video frame of the latent frame before.
+            actions: one of the rows of `embed`, `[B, …]`.
+
+        Returns:
+            The state in the last video frame, and a course `[B, stride, …]`.
         """
 
     @abstractmethod
@@ -175,3 +178,27 @@ class Group(nn.Module, ABC):
     @abstractmethod
     def movers(self) -> Sequence[nn.Module]:
         """The modules that move things."""
+
+
+class SteppedGroup(Group):
+    """A group of things that move from video frame to video frame, as their states are known.
+
+    Its `embed` returns `[B, L, stride, …]`.
+    """
+
+    @abstractmethod
+    def step(self, state: Any, action: Tensor) -> Any:
+        """The state one video frame later.
+
+        Args:
+            state: in the video frame before.
+            action: that of the video frame, `[B, …]`.
+        """
+
+    def move(self, state: Any, actions: Tensor) -> tuple[Any, Any]:
+        """The state one latent frame later; see `Group.move`."""
+        frames: list[Any] = []
+        for action in actions.unbind(1):
+            state = self.step(state, action)
+            frames.append(self.frame(state))
+        return state, stacked(frames)

@@ -152,7 +152,7 @@ class Overview(Look):
     Args:
         latent_channels: channels C of the latent.
         channels: channels of its convolutions.
-        points: places in the picture that are told.
+        points: number of places in the picture that the summary has.
 
     Attributes:
         size: number of values of `summary`.

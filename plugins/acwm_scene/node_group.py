@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from acwm_core.model.batch import to_device
 from acwm_scene.declared import GroupSpec, unit_of
-from acwm_scene.group import Group, energy_score
+from acwm_scene.group import SteppedGroup, energy_score
 from acwm_scene.node_motion import NodeMotion
 from acwm_scene.node_painter import NodePainter
 from acwm_scene.node_sight import NodeSight, form_loss
@@ -56,7 +56,7 @@ class Nodes(NamedTuple):
     chance: tuple[Tensor, ...] = ()
 
 
-class NodeGroup(Group):
+class NodeGroup(SteppedGroup):
     """One rope or cloth, and the agents that the actions move. In the given frame nothing moves.
 
     Args:
@@ -122,15 +122,11 @@ class NodeGroup(Group):
         """The form of a state."""
         return state.form
 
-    def with_draw(self, state: Nodes, draw: Tensor) -> Nodes:
-        """The state with the numbers that its future depends on."""
-        return state._replace(chance=(draw,))
-
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by video frames; see `ValueMotion.embed`."""
         return self.agent_motion.embed(modulation)
 
-    def move(self, state: Nodes, action: Tensor) -> Nodes:
+    def step(self, state: Nodes, action: Tensor) -> Nodes:
         """The agents follow the action, and push or pull the nodes."""
         form = state.form
         agents, hidden = self._followed_by(form.agents, action, state.hidden)
@@ -200,7 +196,7 @@ class NodeGroup(Group):
 
     def _agent_loss(self, agents: Tensor, actions: Tensor, random: Generator) -> Tensor:
         chosen = torch.randperm(len(agents), generator=random)[:FOLLOWED].to(agents.device)
-        agents, actions = agents[chosen], actions[chosen]
+        agents, actions = agents[chosen], actions[chosen].flatten(1, 2)
         noise = to_device(torch.randn(agents[:, 0].shape, generator=random), agents)
         passed: list[Tensor] = []
         places = agents[:, 0] + START_NOISE * noise

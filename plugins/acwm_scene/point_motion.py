@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_scene.value_layers import ACTION, HIDDEN
+from acwm_scene.poses import waves, waves_size
+from acwm_scene.value_layers import HIDDEN
+
+ACTION = 32
+"""Values that tell of the actions of a latent frame."""
 
 CORE = 32
 """Numbers that actions move, and that points may follow."""
@@ -18,12 +21,15 @@ IDENTITY, MEMORY, CHANNELS, OCTAVES = 16, 48, 64, 4
 """Of the interaction of points: numbers that tell one point from another, the size of what each
 remembers, that of the hidden layers, and frequencies in which distances are seen."""
 
-STEP = 0.1
-"""Scale of a change in a video frame."""
+UNITS = 4.0
+"""Units of `waves` in half the width of a picture, so that the longest wave is a picture long."""
+
+STEP = 0.3
+"""Scale of a change in a latent frame."""
 
 
 class Points(NamedTuple):
-    """The state of points in a video frame.
+    """The state of points in a latent frame.
 
     Attributes:
         points: where they are and what they look like, `[B, K, 2 + F]`.
@@ -61,20 +67,19 @@ class PointMotion(nn.Module):
         points: number of points K.
         features: number of features F of each.
         width: size of the embedded actions.
-        stride: video frames per latent frame, whose actions are embedded together.
         noise: numbers of a draw that the motion depends on; 0 for one future.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, points: int, features: int, width: int, stride: int, noise: int = 0) -> None:
+    def __init__(self, points: int, features: int, width: int, noise: int = 0) -> None:
         super().__init__()
         self.points, entries = points, 2 + features
         size = points * entries
         self.register_buffer("mean", torch.zeros(points, entries))
         self.register_buffer("std", torch.ones(points, entries))
-        self.actions = nn.Linear(width, stride * ACTION)
+        self.actions = nn.Linear(width, ACTION)
         self.chance = nn.Linear(noise, ACTION, bias=False) if noise else None
         self.core, self.start = nn.Linear(size, CORE), nn.Linear(size, HIDDEN)
         self.gru = nn.GRUCell(ACTION + CORE, HIDDEN)
@@ -88,10 +93,10 @@ class PointMotion(nn.Module):
         self.identity = nn.Parameter(torch.randn(points, IDENTITY))
         own = IDENTITY + entries
         self.remember = nn.Linear(own, MEMORY)
-        self.apart = nn.Linear(2 + 4 * OCTAVES, CHANNELS)
+        self.apart = nn.Linear(waves_size(2, OCTAVES), CHANNELS)
         self.receiver, self.sender = (nn.Linear(own + MEMORY + ACTION, CHANNELS) for _ in range(2))
         self.message = nn.Linear(CHANNELS, CHANNELS)
-        self.update = nn.GRUCell(own + ACTION + CHANNELS + 4 * OCTAVES, MEMORY)
+        self.update = nn.GRUCell(own + ACTION + CHANNELS + waves_size(2, OCTAVES), MEMORY)
         self.push = nn.Sequential(
             nn.Linear(MEMORY + own + ACTION + CHANNELS, CHANNELS),
             nn.SiLU(),
@@ -99,10 +104,9 @@ class PointMotion(nn.Module):
         )
 
     def embed(self, modulation: Tensor) -> Tensor:
-        """Embedded actions `[B, L, width]` by video frames, `[B, L stride, ACTION]`."""
+        """The actions of latent frames `[B, L, width]`, `[B, L, ACTION]`."""
         with torch.autocast(modulation.device.type, enabled=False):  # errors add up
-            actions = self.actions(modulation.float())
-        return actions.reshape(len(actions), -1, ACTION)
+            return self.actions(modulation.float())
 
     def begin(self, points: Tensor) -> Points:
         """The state of points `[B, K, 2 + F]` at rest."""
@@ -121,7 +125,7 @@ class PointMotion(nn.Module):
         )
 
     def forward(self, action: Tensor, state: Points) -> Points:
-        """The state one video frame later, by embedded actions `[B, ACTION]`."""
+        """The state one latent frame later, by embedded actions `[B, ACTION]`."""
         if self.chance:
             action = action + self.chance(*state.chance)
         inputs = torch.cat([action, state.core], -1)
@@ -145,22 +149,15 @@ class PointMotion(nn.Module):
         return torch.cat([self.identity.expand(len(points), -1, -1), points], -1)
 
     def _pushed(self, points: Tensor, memory: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """What each point hears from all others moves it, `[B, K, 2 + F]`; and its memory."""
+        """How far messages from all others move each point, `[B, K, 2 + F]`; and its memory."""
         own = self._own(points)
         action = action[:, None].expand(-1, self.points, -1)
         node = torch.cat([own, memory, action], -1)
-        places = points[..., :2]
-        apart = self.apart(waves(places[:, None] - places[:, :, None]))
+        places = UNITS * points[..., :2]
+        apart = self.apart(waves(places[:, None] - places[:, :, None], OCTAVES))
         edges = apart + self.receiver(node)[:, :, None] + self.sender(node)[:, None]
         messages = functional.silu(self.message(functional.silu(edges).mean(2)))
         inputs = torch.cat([own, action, messages], -1)
-        seen = torch.cat([inputs, waves(places)[..., 2:]], -1)
+        seen = torch.cat([inputs, waves(places, OCTAVES)], -1)
         memory = self.update(seen.flatten(0, 1), memory.flatten(0, 1)).view_as(memory)
         return self.push(torch.cat([memory, inputs], -1)), memory
-
-
-def waves(places: Tensor) -> Tensor:
-    """Coordinates `[…, 2]` with their sines and cosines in `OCTAVES` frequencies."""
-    octaves = 2.0 ** torch.arange(OCTAVES, device=places.device, dtype=places.dtype)
-    angles = (places[..., None] * (math.pi * octaves)).flatten(-2)
-    return torch.cat([places, angles.sin(), angles.cos()], -1)

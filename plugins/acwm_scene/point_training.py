@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 from torch.optim import AdamW
 
-from acwm_core.errors import TrainingError
-from acwm_core.executors import progress_bar
 from acwm_core.model.objectives.objective import TrainingClips
 from acwm_core.training.muon import Float32Muon
 from acwm_scene.points import PointGroup
 from acwm_scene.scene import SceneDynamics
+from acwm_scene.stage import Stage
 
 CLIPS, DRAWN = 8, 4
 """Clips per step, and frames of each that are drawn on another one of it."""
 
-RATE, MATRIX_RATE, WARMUP, STEADY, CLIPPED = 2e-3, 4e-3, 50, 0.2, 1.0
-"""Peak learning rates of AdamW and of Muon, the steps until they are reached, the share of the
-training in which they stay, and the largest norm of the gradient."""
+RATE, MATRIX_RATE = 2e-3, 4e-3
+"""Peak learning rates of AdamW and of Muon."""
+
+POINTS = Stage("what there is", "objective.point_steps", warmup=50, decay=1.25, clipped=1.0)
 
 MEASURED_CLIPS, READ_AT_ONCE = 256, 64
 """Clips whose frames make up the average frame, and clips that are read at once."""
@@ -72,38 +72,17 @@ def states_with_points(model: SceneDynamics, clips: TrainingClips) -> Tensor:
 
 
 def _train(model: SceneDynamics, clips: TrainingClips, steps: int, random: torch.Generator) -> None:
-    weights = [each for each in model.parameters() if each.requires_grad]
     matrices = model.matrices()
-    others = [each for each in weights if all(each is not matrix for matrix in matrices)]
-    optimizers: list[Any] = [
-        AdamW(others, RATE, betas=(0.9, 0.99), weight_decay=0.01),
-        Float32Muon(matrices, lr=MATRIX_RATE, weight_decay=0.01),
+    numbers = {id(matrix) for matrix in matrices}
+    others = [each for each in model.parameters() if each.requires_grad and id(each) not in numbers]
+    muon = Float32Muon(matrices, weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    optimizers = [
+        (AdamW(others, betas=(0.9, 0.99), weight_decay=0.01), RATE),
+        (muon, MATRIX_RATE),
     ]
-    loss = torch.zeros(())
-    bar = progress_bar(
-        *("what there is", steps),
-        unit="steps",
-        shown=clips.shows_progress,
-        note=lambda: f"loss {loss:.4f}",
+    POINTS.train(
+        lambda _: pair_loss(model, clips, random), optimizers, steps, shown=clips.shows_progress
     )
-    with bar as report:
-        for step in range(steps):
-            share = min(1, (step + 1) / WARMUP, (1 - step / steps) / (1 - STEADY))
-            for optimizer, rate in zip(optimizers, (RATE, MATRIX_RATE), strict=True):
-                optimizer.param_groups[0]["lr"] = rate * share
-                optimizer.zero_grad()
-            loss = pair_loss(model, clips, random)
-            cast(Any, loss).backward()
-            if not nn.utils.clip_grad_norm_(weights, CLIPPED).isfinite():
-                raise TrainingError(
-                    f"the loss of what there is is not finite in step {step + 1} of "
-                    "objective.point_steps"
-                )
-            for optimizer in optimizers:
-                optimizer.step()
-            report(1)
-    for parameter in weights:
-        parameter.grad = None
 
 
 def pair_loss(model: SceneDynamics, clips: TrainingClips, random: torch.Generator) -> Tensor:
@@ -154,10 +133,10 @@ def _measure(
     def drawn(states: Tensor) -> Tensor:
         return model.draw_true(latents[:, :1], states, _numbers(latents))
 
-    usual, costs = drawn(states), torch.zeros_like(std)
+    reference, costs = drawn(states), torch.zeros_like(std)
     for point, entry in np.ndindex(*std.shape):
         other = states.clone()
         column = model.columns["points"][point * std.shape[1] + entry]
         other[:, 1:, column] += PROBE * std[point, entry]
-        costs[point, entry] = (drawn(other) - usual).square().mean().sqrt()
+        costs[point, entry] = (drawn(other) - reference).square().mean().sqrt()
     points.measure(read, costs)

@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from acwm_core.model.batch import to_device
-from acwm_scene.group import Group, energy_score
+from acwm_scene.group import Group, energy_score, stacked
 from acwm_scene.point_motion import PointMotion, Points
 from acwm_scene.point_painter import PointPainter
 from acwm_scene.point_sight import PointSight
@@ -28,8 +28,8 @@ WINDOWS = ((0.35, 2), (0.7, 5))
 """Until which share of the training motion is learned from windows of so many latent frames; then
 from whole clips, in which errors add up."""
 
-MOVED_FRAMES, FEWEST_CLIPS = 768, 24
-"""Most video frames that a step of motion moves, of all its clips, and the fewest clips."""
+MOVED_FRAMES, FEWEST_CLIPS = 512, 24
+"""Most latent frames that a step of motion moves, of all its clips, and the fewest clips."""
 
 ALIVE = 0.08
 """A point is alive if the drawing cares for it so much, as a share of what it cares for most."""
@@ -66,7 +66,7 @@ class PointGroup(Group):
         self.stride, self.noise, self.shape = stride, noise, (points, 2 + FEATURES)
         self.register_buffer("weight", torch.ones(self.shape))
         self.sight = PointSight(latent_channels, points, FEATURES)
-        self.motion = PointMotion(points, FEATURES, width, stride, noise)
+        self.motion = PointMotion(points, FEATURES, width, noise)
         self.painter = PointPainter(points, FEATURES, channels=channels, width=width)
 
     @property
@@ -110,17 +110,14 @@ class PointGroup(Group):
         """The points of a state."""
         return state.points
 
-    def with_draw(self, state: Points, draw: Tensor) -> Points:
-        """The state with the numbers that its future depends on."""
-        return state._replace(chance=(draw,))
-
     def embed(self, modulation: Tensor) -> Tensor:
-        """Embedded actions by video frames; see `PointMotion.embed`."""
+        """Embedded actions by latent frames; see `PointMotion.embed`."""
         return self.motion.embed(modulation)
 
-    def move(self, state: Points, action: Tensor) -> Points:
-        """The points one video frame later."""
-        return self.motion(action, state)
+    def move(self, state: Points, actions: Tensor) -> tuple[Points, Tensor]:
+        """The points one latent frame later, in which they do not move; see `Group.move`."""
+        state = self.motion(actions, state)
+        return state, stacked([state.points] * self.stride)
 
     def canvas(self, features: Tensor, past: Tensor) -> tuple[Tensor, Tensor]:
         """A map of the points in the given frame, which are remembered."""
@@ -156,7 +153,7 @@ class PointGroup(Group):
         course = self.encode(states)[:, :: self.stride]
         last = course.shape[1] - 1
         frames = next((size for until, size in WINDOWS if progress < until and size < last), last)
-        clips = max(FEWEST_CLIPS, MOVED_FRAMES // (frames * self.stride))
+        clips = max(FEWEST_CLIPS, MOVED_FRAMES // frames)
         first = int(torch.randint(last - frames + 1, (), generator=random))
         if torch.rand((), generator=random) < 0.4:
             first = 0
@@ -164,7 +161,7 @@ class PointGroup(Group):
         noise = to_device(torch.randn(course[:, 0].shape, generator=random), course)
         with torch.autocast(states.device.type, enabled=False):
             start = course[:, 0] + START_NOISE * self.motion.std * noise
-            rows = actions[:, (first + 1) * self.stride :][:, : frames * self.stride]
+            rows = actions[:, first + 1 :][:, :frames]
             later = self.weight * course[:, 1:]
             if not self.noise:
                 moved = self.weight * self._moved(start, rows)
@@ -182,13 +179,13 @@ class PointGroup(Group):
         return (self.motion,)
 
     def _moved(self, start: Tensor, actions: Tensor, *chance: Tensor) -> Tensor:
-        """The points after each latent frame, `[B, H, K, 2 + F]`."""
+        """The points after each of the actions `[B, H, ACTION]`, `[B, H, K, 2 + F]`."""
         moved: list[Tensor] = []
         state = self.motion.begin(start)._replace(chance=chance)
         for action in actions.unbind(1):
             state = self.motion(action, state)
             moved.append(state.points)
-        return torch.stack(moved[self.stride - 1 :: self.stride], 1)
+        return torch.stack(moved, 1)
 
 
 def point_distance(first: Tensor, second: Tensor) -> Tensor:

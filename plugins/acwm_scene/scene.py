@@ -168,19 +168,21 @@ class SceneDynamics(Predictor):
             given[:, -1], {name: group.read(given) for name, group in self._groups()}
         )
 
-    def move(self, scene: Scene, actions: Mapping[str, Tensor]) -> Scene:
-        """The scene one video frame later.
+    def move(self, scene: Scene, actions: Mapping[str, Tensor]) -> tuple[Scene, dict[str, Any]]:
+        """The scene one latent frame later, and the courses of its video frames.
 
         Args:
-            scene: in the video frame before.
+            scene: after the latent frame before.
             actions: for each group one of the rows of its embedded actions, `[B, …]`.
+
+        Returns:
+            The scene, and courses `[B, stride, …]`, by group.
         """
+        states, courses = dict[str, Any](), dict[str, Any]()
         with torch.autocast(scene.base.device.type, enabled=False):
-            states = {
-                name: group.move(scene.states[name], actions[name])
-                for name, group in self._groups()
-            }
-        return scene._replace(states=states)
+            for name, group in self._groups():
+                states[name], courses[name] = group.move(scene.states[name], actions[name])
+        return scene._replace(states=states), courses
 
     def draw(self, scene: Scene, shown: Mapping[str, Any]) -> Tensor:
         """The latent frame `[B, C, h, w]` of courses `[B, stride, …]`, the last frame first."""
@@ -278,15 +280,15 @@ class SceneDynamics(Predictor):
 
     def next_frame(self, scene: Scene, conditioning: Conditioning) -> tuple[Latent, Scene]:
         """The next latent frame `[B, 1, C, h, w]` and its scene, given the last conditioning."""
-        actions = {name: rows[:, -self.stride :] for name, rows in self.embed(conditioning).items()}
-        scene, frames = self._latent_frame_later(scene, actions)
-        shown = {name: stacked([each[name] for each in reversed(frames)]) for name in self.columns}
-        return self.draw(scene, shown)[:, None], scene
+        actions = {name: rows[:, -1] for name, rows in self.embed(conditioning).items()}
+        scene, courses = self.move(scene, actions)
+        last_first = tree_map(lambda values: torch.stack(values.unbind(1)[::-1], 1), courses)
+        return self.draw(scene, last_first)[:, None], scene
 
     # What training needs -----------------------------------------------------------------------
 
     def embed(self, conditioning: Conditioning) -> dict[str, Tensor]:
-        """The embedded actions of a clip as each group takes them, `[B, L · stride, …]`.
+        """The embedded actions of a clip as each group takes them, `[B, L, …]`.
 
         Raises:
             RecipeError: the conditioner gives no modulation.
@@ -444,26 +446,14 @@ class SceneDynamics(Predictor):
         self, scene: Scene, actions: Mapping[str, Tensor], known: int, frames: int
     ) -> dict[str, Any]:
         """The courses from the scene on, `[B, 1 + T, …]`."""
-        passed = [self._frames_of(scene)]
-        for latent_frame in range(known, frames):
-            rows = slice(latent_frame * self.stride, (latent_frame + 1) * self.stride)
-            now = {name: values[:, rows] for name, values in actions.items()}
-            scene, later = self._latent_frame_later(scene, now)
-            passed += later
-        return {name: stacked([each[name] for each in passed]) for name in self.columns}
-
-    def _latent_frame_later(
-        self, scene: Scene, actions: Mapping[str, Tensor]
-    ) -> tuple[Scene, list[dict[str, Any]]]:
-        """The scene after a latent frame, and how things are in each of its video frames."""
-        frames: list[dict[str, Any]] = []
-        for number in range(self.stride):
-            scene = self.move(scene, {name: rows[:, number] for name, rows in actions.items()})
-            frames.append(self._frames_of(scene))
-        return scene, frames
-
-    def _frames_of(self, scene: Scene) -> dict[str, Any]:
-        return {name: group.frame(scene.states[name]) for name, group in self._groups()}
+        passed = [
+            {name: stacked([group.frame(scene.states[name])]) for name, group in self._groups()}
+        ]
+        for frame in range(known, frames):
+            now = {name: rows[:, frame] for name, rows in actions.items()}
+            scene, courses = self.move(scene, now)
+            passed.append(courses)
+        return tree_map(lambda *values: torch.cat(values, 1), *passed)
 
     def _drawn_courses(self, scene: Scene, courses: Mapping[str, Any], numbers: Tensor) -> Latent:
         """The latent frames with these numbers, 1 for the first one after the given ones."""

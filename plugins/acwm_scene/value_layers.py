@@ -81,13 +81,10 @@ class ValueMotion(nn.Module):
         )
 
     def embed(self, modulation: Tensor) -> Tensor:
-        """Embedded actions `[B, L, width]` by video frames, `[B, L stride, ACTION]`.
-
-        The first `stride` rows are of the first latent frame, which no action leads to.
-        """
+        """Embedded actions `[B, L, width]` by video frames, `[B, L, stride, ACTION]`."""
         with torch.autocast(modulation.device.type, enabled=False):  # errors of values add up
             actions = self.actions(modulation.float())
-        return actions.reshape(len(actions), -1, ACTION)
+        return actions.unflatten(-1, (-1, ACTION))
 
     def begin(self, states: Tensor) -> Tensor:
         """The hidden state `[B, HIDDEN]` of a scene that is as `[B, S]` says, and at rest."""

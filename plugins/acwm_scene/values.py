@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from acwm_core.model.batch import to_device
 from acwm_scene.declared import GroupSpec
-from acwm_scene.group import Group, energy_score
+from acwm_scene.group import SteppedGroup, energy_score
 from acwm_scene.value_layers import ValueMotion, ValuePainter, ValueSight
 
 START_NOISE = 0.03
@@ -42,7 +42,7 @@ class Values(NamedTuple):
     chance: tuple[Tensor, ...] = ()
 
 
-class ValueGroup(Group):
+class ValueGroup(SteppedGroup):
     """Values that tell all that moves, with a unit of one standard deviation each.
 
     An angle is its cosine and sine, so that it may wrap. The last of the values may follow from the
@@ -128,15 +128,11 @@ class ValueGroup(Group):
         """The values of a state."""
         return state.values
 
-    def with_draw(self, state: Values, draw: Tensor) -> Values:
-        """The state with the numbers that its future depends on."""
-        return state._replace(chance=(draw,))
-
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by video frames; see `ValueMotion.embed`."""
         return self.motion.embed(modulation)
 
-    def move(self, state: Values, action: Tensor) -> Values:
+    def step(self, state: Values, action: Tensor) -> Values:
         """The values one video frame later."""
         values, hidden = self.motion(action, state.values, state.hidden, state.chance)
         return state._replace(values=values, hidden=hidden)
@@ -176,7 +172,7 @@ class ValueGroup(Group):
         frames = next((size for until, size in HORIZONS if progress < until and size < last), last)
         first = int(torch.randint(last - frames + 1, (), generator=random))
         clips = max(1, MOVED_FRAMES // frames)
-        true, noise, actions = true[:clips], noise[:clips], actions[:clips]
+        true, noise, actions = true[:clips], noise[:clips], actions[:clips].flatten(1, 2)
         with torch.autocast(true.device.type, enabled=False):
             start = true[:, first] + START_NOISE * noise
             rows = actions[:, self.stride + first :][:, :frames]

@@ -6,7 +6,7 @@ from torch.nn import functional
 from acwm_core.model.objectives.regression import Regression
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
-from acwm_scene.group import at_frame, stacked
+from acwm_scene.group import at_frame, stacked, tree_map
 
 BOUNDS = [-1.0, -1.0], [1.0, 1.0]
 
@@ -56,11 +56,11 @@ def follow(world, states, actions):
     courses = {}
     for name, group in model.groups.named_children():
         first = at_frame(group.encode(states[..., model.columns[name]]), 0)
-        state, passed = group.begin(first, first), [first]
-        for action in embedded[name][:, 1:].unbind(1):
-            state = group.move(state, action)
-            passed.append(group.frame(state))
-        courses[name] = stacked(passed)
+        state, passed = group.begin(first, first), [stacked([first])]
+        for actions_of_frame in embedded[name][:, 1:].unbind(1):
+            state, course = group.move(state, actions_of_frame)
+            passed.append(course)
+        courses[name] = tree_map(lambda *values: torch.cat(values, 1), *passed)
     return courses
 
 

@@ -88,14 +88,15 @@ def test_joined_optimizers_do_what_each_would_do_alone():
         torch.testing.assert_close(mine, theirs)
 
 
-def test_muon_in_float32_does_what_pytorchs_does_but_for_the_rounding(monkeypatch):
+@pytest.mark.parametrize("adjusted", ["match_rms_adamw", "original", None])
+def test_muon_in_float32_does_what_pytorchs_does_but_for_the_rounding(adjusted, monkeypatch):
     monkeypatch.setattr(torch.Tensor, "bfloat16", torch.Tensor.float)
     torch.manual_seed(0)
     shapes = ((4, 12), (12, 4), (6, 6))
     mine, theirs = ([torch.nn.Parameter(torch.randn(shape)) for shape in shapes] for _ in range(2))
     for one, other in zip(mine, theirs, strict=True):
         other.data.copy_(one)
-    settings = {"lr": 0.02, "weight_decay": 0.1, "adjust_lr_fn": "match_rms_adamw"}
+    settings = {"lr": 0.02, "weight_decay": 0.1, "adjust_lr_fn": adjusted}
     optimizers = Float32Muon(mine, **settings), Muon(theirs, **settings)
     for _ in range(3):
         gradients = [torch.randn(shape) for shape in shapes]
