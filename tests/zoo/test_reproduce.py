@@ -1,15 +1,21 @@
-"""The commands under "Reproduce it" of every model that ships run, on little data, in few steps."""
+"""The commands under "Reproduce it" of the models that ship ask for the same again, and run."""
 
 import html
 import re
 import shlex
+import shutil
+from pathlib import Path
 
 import pytest
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
+from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.results import Summary
-from acwm_core.training.run_folder import RunFolder, copy_of
+from acwm_core.recipe import Recipe, compose
+from acwm_core.recipe.former import current_settings
+from acwm_core.training.run_folder import RunFolder, copy_of, run_to_write
+from acwm_report.reproduce import commands
 from acwm_zoo.shipped import folder, shipped
 
 QUICK_FIT = [
@@ -56,24 +62,69 @@ def few(line, learns_motion):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", ["push_cube_draws", "reacher"])
 def test_every_printed_command_runs(name, tmp_path, monkeypatch):
+    """On little data, in few steps; of bodies with draws, and of values."""
     monkeypatch.chdir(tmp_path)
     lines = printed(name)
     recipe = RunFolder(folder(name)).recipe.read_text("utf-8")
     learns_motion = re.search(r"motion_steps: [1-9]", recipe) is not None
-    commands = [few(line, learns_motion) for line in lines]
-    assert [command for command, _ in commands][-3:] == ["fit", "evaluate", "report"]
-    for command, words in commands:
+    given = [few(line, learns_motion) for line in lines]
+    assert [command for command, _ in given][-3:] == ["fit", "evaluate", "report"]
+    for command, words in given:
         run(command, *words)
     assert (copy_of(name).with_name(f"{name}-again") / "report.html").is_file()
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the commands ask for: they write a card instead of data, and copy the shipped run."""
+    made = {}
+
+    def fill(out, wanted, *_, **__):
+        out.mkdir(parents=True)
+        wanted.write(out)
+        made[out] = wanted
+        return wanted
+
+    def fit(recipe, out, **__):
+        made["recipe"] = recipe
+        name = out.name.removesuffix("-again")
+        return shutil.copytree(folder(name), out)
+
+    def evaluate_run(run, *, data, overrides, **__):
+        made["tests"] = data or compose(RunFolder(run).recipe, []).data["path"]
+        settings = compose(RunFolder(run).recipe, overrides).evaluation
+        made["settings"] = EvaluationConfig(**settings).to_dict()
+
+    monkeypatch.setattr("acwm_core.data.generate.fill", fill)
+    monkeypatch.setattr("acwm_core.training.fit.fit", fit)
+    monkeypatch.setattr("acwm_interventions.evaluate.evaluate_run", evaluate_run)
+    monkeypatch.setattr("acwm_report.commands.print_summary", lambda summary: None)
+    return made
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_its_commands_ask_for_the_same_data_recipe_and_settings(name, tmp_path, monkeypatch, asked):
+    monkeypatch.chdir(tmp_path)
+    summary = Summary.read(folder(name))
+    *lines, report = commands(run_to_write(name), summary)
+    for line in lines:
+        run(*shlex.split(line)[1:])
+    assert report == f"acwm report {copy_of(name)}-again"
+    assert asked["recipe"] == Recipe.from_yaml(RunFolder(folder(name)).recipe)
+    wanted = current_settings(summary.provenance["evaluation"])
+    assert {key: asked["settings"][key] for key in wanted} == wanted
+    assert asked["settings"].keys() - wanted.keys() <= {"protocol"}
     card = DatasetCard.read(RunFolder(folder(name)).card)
-    made = {path.parent: DatasetCard.read(path) for path in (tmp_path / "data").glob("*/card.yaml")}
-    assert any(  # the data that it was trained on, and not those that it was tested on
-        (each.seed, each.exploration, each.shift) == (card.seed, card.exploration, card.shift)
-        and each.splits["train"]
-        for each in made.values()
-    )
+    trained_on = asked[Path(asked["recipe"].data["path"])]
+    for key in ("seed", "exploration", "shift", "options", "factors"):
+        assert getattr(trained_on, key) == getattr(card, key), key
+    assert trained_on.splits["train"] == card.splits["train"]
+    tests, facts = asked[Path(asked["tests"])], summary.provenance["dataset"]
+    assert (tests.environment.name, tests.seed) == (facts["environment"], facts["seed"])
+    for split in ("ind_test", "ood_test"):
+        assert tests.splits[split] == facts["episodes"][split]
 
 
 @pytest.mark.parametrize("name", shipped())
