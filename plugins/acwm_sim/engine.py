@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import inspect
 import io
 import linecache
 import operator
@@ -10,8 +11,10 @@ import sys
 import tempfile
 import threading
 import warnings
+from collections.abc import Iterator
 from multiprocessing.util import Finalize
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -35,9 +38,37 @@ def _give_home() -> None:
             os.environ["HOME"] = str(cache_folder())
 
 
+def _statement(frame: FrameType) -> str:
+    """The line that a frame is at."""
+    return linecache.getline(frame.f_code.co_filename, frame.f_lineno)
+
+
+@contextlib.contextmanager
+def _frames_told_by_line() -> Iterator[None]:
+    """Let `inspect.getframeinfo` read the line of a frame, and do no more.
+
+    Taichi asks at each of its own hundred decorators what it stands in, and `inspect` searches all
+    imported modules for the answer: many seconds where torch was imported before.
+    """
+    usual = inspect.getframeinfo
+
+    def told(frame: Any, context: int = 1) -> Any:
+        if context != 1 or not inspect.isframe(frame):
+            return usual(frame, context)
+        code = frame.f_code
+        line = [_statement(frame)]
+        return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, line, 0)
+
+    inspect.getframeinfo = told
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = usual
+
+
 _give_home()
 try:
-    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0"):
+    with undisturbed(*_VARIABLES, ENABLE_TAICHI_HEADER_PRINT="0"), _frames_told_by_line():
         import taichi as ti
         from taichi.lang import impl, kernel_impl
         from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
@@ -66,12 +97,8 @@ ASTTransformerContext.get_pos_info = _position
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
-    """Whether the statement of the frame that many levels up begins a class.
-
-    Taichi asks at each decorator, by a function that searches all imported modules.
-    """
-    frame = sys._getframe(level_of_class_stackframe)
-    line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
+    """Whether the statement of the frame that many levels up begins a class, for decorators."""
+    line = _statement(sys._getframe(level_of_class_stackframe)).strip()
     return any(pattern.match(line) for pattern in kernel_impl._KERNEL_CLASS_STACKFRAME_STMT_RES)
 
 
