@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import tempfile
@@ -160,7 +161,7 @@ class EpisodeDataset:
             DataError: its shard is missing or damaged.
         """
         reader, position = self._locate(index)
-        return reader.episode(position)
+        return reader.episode(position, self.card.environment.frame_size)
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[index] for index in range(len(self)))
@@ -168,7 +169,9 @@ class EpisodeDataset:
     def video(self, index: int, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
         """Frames `start` to `stop` of an episode, ``[T, 3, H, W]`` uint8."""
         reader, position = self._locate(index)
-        return reader.decoded(position, "video.mkv", lambda data: decode_planes(data, start, stop))
+        size, length = self.card.environment.frame_size, self.lengths[index]
+        decode = functools.partial(decode_planes, start=start, stop=stop, size=size, length=length)
+        return reader.decoded(position, "video.mkv", decode)
 
     def video_into(self, target: NDArray[np.uint8], index: int, start: int) -> None:
         """Decode frames of an episode, from frame `start` on, into `target` ``[T, 3, H, W]`` uint8.

@@ -14,7 +14,7 @@ import os
 import re
 import tarfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypeVar, cast
@@ -294,15 +294,18 @@ class ShardReader:
 
         return self.decoded(position, "json", parsed)
 
-    def episode(self, position: int) -> Episode:
-        """Read and decode one whole episode."""
+    def episode(self, position: int, size: Sequence[int] | None = None) -> Episode:
+        """Read and decode one whole episode, whose frames must have the height and width `size`."""
         about = self.about(position)
+        actions = self.array(position, "actions.npy")
+        most = len(actions) + 1 if actions.ndim else 0  # `Episode` names what differs by one
+        whole = {"size": size, "length": most}
         return Episode(
             spec=EpisodeSpec.from_dict(about["spec"]),
-            video=self.decoded(position, "video.mkv", decode_video),
-            actions=self.array(position, "actions.npy"),
+            video=self.decoded(position, "video.mkv", functools.partial(decode_video, **whole)),
+            actions=actions,
             states=self.decoded(position, "states.npz", from_npz),
-            masks=self.decoded(position, "mask.mkv", decode_masks),
+            masks=self.decoded(position, "mask.mkv", functools.partial(decode_masks, **whole)),
             contacts=self.array(position, "contacts.npy"),
             factors=about["factors"],
             ood_label=about["ood_label"],

@@ -50,6 +50,12 @@ MP4 = Encoding("rgb24", "yuv420p", "libx264", _SMALL, "mp4")
 KEYFRAMES = 16
 """Number of frames from one key frame of a video to the next."""
 
+MOST_PIXELS = 2**26
+"""Pixels of a frame. Few bytes can claim more, and unpacking them would take all memory."""
+
+LIMITS = {"max_pixels": str(MOST_PIXELS)}
+"""Options of FFmpeg for files of strangers."""
+
 PLANES_OF_RGB = (2, 0, 1)  # FFmpeg's planar RGB is ordered green, blue, red
 
 
@@ -75,14 +81,29 @@ def encode_masks(masks: NDArray[np.uint8], fps: float = 10) -> bytes:
     return encode_frames(masks, masks.shape[1:], MASK, fps, keyframes=len(masks))
 
 
-def decode_planes(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
+def decode_planes(
+    data: bytes,
+    start: int = 0,
+    stop: int | None = None,
+    *,
+    size: Sequence[int] | None = None,
+    length: int | None = None,
+) -> NDArray[np.uint8]:
     """Frames `start` to `stop` of `encode_video`'s bytes, as ``[T, 3, H, W]`` uint8.
 
+    Args:
+        data: the bytes.
+        start: the first frame.
+        stop: the frame after the last; all by default.
+        size: height and width that they must have. Few bytes can hold more than the memory, so name
+            it for files of strangers.
+        length: number of frames that all must be, if `stop` is not given.
+
     Raises:
-        DataError: the bytes are not a video, or it ends before `stop`.
+        DataError: the bytes are not a video of this size and length, or it ends before `stop`.
     """
     decoded: list[NDArray[np.uint8]] = []
-    for frame in _decode(data, start, stop):
+    for frame in _expected(_decode(data, start, stop), size, length):
         decoded.append(np.empty((3, frame.height, frame.width), np.uint8))
         _copy_planes(frame, decoded[-1])
     return _complete(decoded, start, stop)
@@ -99,8 +120,7 @@ def decode_into(target: NDArray[np.uint8], data: bytes, start: int) -> None:
     index = -1
     for index, frame in enumerate(_decode(data, start, start + len(target))):
         if (frame.height, frame.width) != target.shape[2:]:
-            height, width = target.shape[2:]
-            raise DataError(f"its frames are {frame.height}×{frame.width}, not {height}×{width}")
+            raise DataError(_other_size(frame, target.shape[2:]))
         _copy_planes(frame, target[index])
     if index + 1 != len(target):
         raise DataError(f"it ends before frame {start + len(target)}: {index + 1} frames decoded")
@@ -115,14 +135,41 @@ def _copy_planes(frame: av.VideoFrame, target: NDArray[np.uint8]) -> None:
         target[:] = image.transpose(2, 0, 1)
 
 
-def decode_video(data: bytes, start: int = 0, stop: int | None = None) -> NDArray[np.uint8]:
+def decode_video(
+    data: bytes,
+    start: int = 0,
+    stop: int | None = None,
+    *,
+    size: Sequence[int] | None = None,
+    length: int | None = None,
+) -> NDArray[np.uint8]:
     """`decode_planes` as ``[T, H, W, 3]`` uint8."""
-    return np.ascontiguousarray(decode_planes(data, start, stop).transpose(0, 2, 3, 1))
+    planes = decode_planes(data, start, stop, size=size, length=length)
+    return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
 
-def decode_masks(data: bytes) -> NDArray[np.uint8]:
-    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; errors as in `decode_planes`."""
-    return _complete([plane_of(frame, 0).copy() for frame in _decode(data, 0, None)], 0, None)
+def decode_masks(
+    data: bytes, *, size: Sequence[int] | None = None, length: int | None = None
+) -> NDArray[np.uint8]:
+    """Instance ids ``[T, H, W]`` uint8 from `encode_masks`' bytes; as `decode_planes` otherwise."""
+    frames = _expected(_decode(data, 0, None), size, length)
+    return _complete([plane_of(frame, 0).copy() for frame in frames], 0, None)
+
+
+def _expected(
+    frames: Iterator[av.VideoFrame], size: Sequence[int] | None, length: int | None
+) -> Iterator[av.VideoFrame]:
+    """The frames, as long as they have a size and are no more than a number."""
+    for index, frame in enumerate(frames):
+        if size is not None and (frame.height, frame.width) != tuple(size):
+            raise DataError(_other_size(frame, size))
+        if length is not None and index >= length:
+            raise DataError(f"it has more than {length} frames")
+        yield frame
+
+
+def _other_size(frame: av.VideoFrame, size: Sequence[int]) -> str:
+    return f"its frames are {frame.height}×{frame.width}, not {size[0]}×{size[1]}"
 
 
 def write_mp4(
@@ -192,11 +239,11 @@ def _decode(data: bytes, start: int, stop: int | None) -> Iterator[av.VideoFrame
     """Decode frames in order, in one thread, because loaders run many decoders in parallel."""
     source: Any
     try:
-        with av.open(io.BytesIO(data), "r", format="matroska") as source:
+        with av.open(io.BytesIO(data), "r", format="matroska", options=LIMITS) as source:
             stream = source.streams.video[0]
             stream.codec_context.thread_count = 1
             # Report damage instead of concealing it.
-            stream.codec_context.options = {"err_detect": "explode"}
+            stream.codec_context.options = {"err_detect": "explode", **LIMITS}
             index, frames = 0, source.decode(stream)
             if start >= KEYFRAMES:
                 first, index = _sought(source, stream, start)

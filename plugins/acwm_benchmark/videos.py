@@ -16,7 +16,7 @@ from PIL import Image, ImageSequence
 
 from acwm_benchmark.tasks import World, read_array
 from acwm_core.errors import DataError
-from acwm_formats.frames import VideoFrames, container_of
+from acwm_formats.frames import VideoFrames, opened_video
 from acwm_formats.names import natural
 from acwm_report.titles import counted
 
@@ -78,13 +78,8 @@ def coding_of(path: Path) -> Coding | None:
     """How a file of a prediction is coded; None for PNG and NPZ, which lose nothing."""
     if path.suffix.lower() not in CONTAINERS:
         return None
-    try:
-        container: Any
-        with av.open(str(path), format=container_of(path) or "none") as container:
-            context = container.streams.video[0].codec_context
-            return Coding(context.name, context.pix_fmt)
-    except (FFmpegError, IndexError, ValueError) as error:
-        raise DataError(f"{path} cannot be read as a video ({error})") from error
+    with opened_video(path) as (_, stream):
+        return Coding(stream.codec_context.name, stream.codec_context.pix_fmt)
 
 
 def read_whole(path: Path, task: str, frames: int, world: World) -> NDArray[np.float32]:

@@ -135,7 +135,7 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))
         expect(same, f"episode {index} has another spec than the card")
-        episode = reader.episode(position)
+        episode = reader.episode(position, card.environment.frame_size)
         frames, said = len(episode.video), record.lengths[position]
         expect(frames == said, f"episode {index} has {frames} frames, the manifest says {said}")
         try:
@@ -169,7 +169,8 @@ def _replays(
         return
     for place in chosen:
         record, position = places[int(place)]
-        stored = open_shard(folder / record.shard).episode(position)
+        size = card.environment.frame_size
+        stored = open_shard(folder / record.shard).episode(position, size)
         what = f"replay of {split} {record.first + position}"
         try:
             again = simulate(environment, stored.spec, stored.actions)

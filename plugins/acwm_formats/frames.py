@@ -17,11 +17,11 @@ from av.error import FFmpegError
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
+from acwm_core.data.video import LIMITS, MOST_PIXELS
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched
 from acwm_formats.channels import STACKED, Channels, channels_of, coloured
 from acwm_formats.images import (
-    MOST_PIXELS,
     channels_last,
     check_pixels,
     guessed_range,
@@ -29,13 +29,22 @@ from acwm_formats.images import (
     read_image,
     to_rgb,
 )
+from acwm_formats.mp4_claims import check_mp4
 from acwm_formats.sources import present
 
 MOST_FRAMES = 10**7
 """Frames of a recording: four days at 30 per second."""
 
-MOST_UNPACKED, DENSEST = 2**31, 5000
-"""Pixels that a GIF may always unpack to, and how many per byte beyond them."""
+OPENING = {"max_pixels": str(2 * MOST_PIXELS)}
+"""Options of FFmpeg while a file is opened: of what it accepts, `check_pixels` says what is wrong."""
+
+MOST_UNPACKED = 2**32
+"""Pixels that a video may always unpack to."""
+
+DENSEST = {"gif": 5000}
+DENSE = 20_000
+"""How many pixels per byte it may unpack to beyond them, by codec: a camera's have a few hundred.
+Frames of 4096×4096 that never change have 33,000 in H.264, and unpack for minutes."""
 
 CONTAINERS = {"mp4": (4, b"ftyp moov mdat wide free skip".split()), "gif": (0, [b"GIF8"])} | {
     "matroska": (0, [b"\x1a\x45\xdf\xa3"]),
@@ -144,7 +153,11 @@ class VideoFrames:
         size = index.size if index.turns % 2 == 0 else index.size[::-1]
         clear = any(component.is_alpha for component in frame.format.components)
         kind = "rgba" if clear else "rgb24"
-        shown = reformatter.reformat(frame, format=kind, height=size[0], width=size[1])
+        try:
+            shown = reformatter.reformat(frame, format=kind, height=size[0], width=size[1])
+        except FFmpegError as error:
+            how = f"its pixels, {frame.format.name}, cannot be converted ({error.strerror})"
+            raise DataError(f"the video {self.path} cannot be read: {how}") from error
         image = to_rgb(shown.to_ndarray())
         return np.ascontiguousarray(np.rot90(image, index.turns)) if index.turns else image
 
@@ -163,15 +176,9 @@ def video_index(path: Path) -> VideoIndex:
 
 @functools.lru_cache(maxsize=64)
 def _index(path: Path, _: str) -> VideoIndex:
-    with _opened(path) as (container, stream):
-        packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
-        context = stream.codec_context
-        if context.name == "gif":
-            _check_gif(path, len(packets) * context.height * context.width)
-    ticks = [p.dts if p.pts is None else p.pts for p in packets]
-    if not ticks or None in ticks:
-        raise DataError(f"the video {path} holds no frame, or frames without times")
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
+        ticks = _ticks(path, container, stream)
+    with opened_video(path) as (container, stream):
         frame = next(container.decode(stream), None)
         if frame is None:
             raise DataError(f"the video {path} holds no frame that can be decoded")
@@ -194,15 +201,37 @@ def _index(path: Path, _: str) -> VideoIndex:
         return VideoIndex(ordered, stream.time_base, stream.average_rate, size, turns, depth)
 
 
-def _check_gif(path: Path, pixels: int) -> None:
-    """Refuse a GIF whose few bytes unpack for minutes: a frame may change one pixel of millions."""
-    if pixels > MOST_UNPACKED and pixels > DENSEST * path.stat().st_size:
-        raise DataError(f"{path} unpacks to {pixels:,} pixels: write it as MP4")
+def _ticks(path: Path, container: Any, stream: Any) -> list[int]:
+    """The times of all frames, in the order of the file; nothing is decoded."""
+    context, ticks = stream.codec_context, list[int]()
+    pixels = max(1, context.height * context.width)
+    most = min(MOST_FRAMES, _most_pixels(path, context.name) // pixels)
+    for packet in container.demux(stream):
+        if not packet.size or packet.is_discard:
+            continue
+        tick = packet.dts if packet.pts is None else packet.pts
+        if tick is None:
+            raise DataError(f"the video {path} holds frames without times")
+        ticks.append(tick)
+        if len(ticks) > most:
+            raise DataError(
+                f"the video {path} unpacks to more than {most:,} frames of {context.height}×"
+                f"{context.width} pixels, too many for its {path.stat().st_size:,} bytes: write it "
+                "again as MP4, in parts if it is long"
+            )
+    if not ticks:
+        raise DataError(f"the video {path} holds no frame")
+    return ticks
+
+
+def _most_pixels(path: Path, codec: str) -> int:
+    """Pixels that a file may unpack to: in a GIF, a frame may change one pixel of millions."""
+    return max(MOST_UNPACKED, DENSEST.get(codec, DENSE) * path.stat().st_size)
 
 
 def _decoded(path: Path, tick: int) -> Iterator[Any]:
     """Decode from the last key frame before `tick` on, or everything if seeking leads beyond it."""
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         if tick > (stream.start_time or 0):
             container.seek(tick, stream=stream)
         frames = _sound(path, container, stream)
@@ -210,37 +239,50 @@ def _decoded(path: Path, tick: int) -> Iterator[Any]:
             yield first
             yield from frames
             return
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         yield from _sound(path, container, stream)
 
 
 def _sound(path: Path, container: Any, stream: Any) -> Iterator[Any]:
     """Decode, and report damage instead of concealing it."""
-    options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
-    stream.codec_context.options = options
+    context = stream.codec_context
+    context.options = {"err_detect": "explode", **LIMITS}
+    most = context.height * context.width
     for frame in container.decode(stream):
+        if frame.height * frame.width > most:
+            raise DataError(f"the video {path} has larger frames from {frame.time or 0:.3f} s on")
         if frame.is_corrupt:
             raise DataError(f"the video {path} is damaged at {frame.time or 0:.3f} s")
         yield frame
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Generator[tuple[Any, Any]]:
-    """Open a file and its video stream; FFmpeg errors inside the block become `DataError`s."""
+def opened_video(path: Path) -> Generator[tuple[Any, Any]]:
+    """Open a file and its video stream; FFmpeg errors inside the block become `DataError`s.
+
+    Raises:
+        DataError: it is no video that is read, or claims more than it can hold.
+    """
     container: Any  # PyAV's type annotations are incomplete
     check_fetched(path)
     kind = container_of(path)
     if kind is None:
         raise DataError(f"{path} is not an MP4, MOV, MKV, WebM, AVI or GIF file")
+    if kind == "mp4":
+        check_mp4(path)
     place = str(path.absolute())  # "concat:a" would be a protocol of FFmpeg
     try:
-        with av.open(place, "r", format=kind, metadata_errors="replace") as container:
+        with av.open(
+            place, "r", format=kind, metadata_errors="replace", options=LIMITS
+        ) as container:
             if not container.streams.video:
                 raise DataError(f"{path} holds no video")
             stream = container.streams.video[0]
             context = stream.codec_context
+            if context is None:
+                raise DataError(f"the video {path} is in a codec that FFmpeg does not know")
             check_pixels(f"the video {path}", context.height, context.width)
-            context.options = {"max_pixels": str(MOST_PIXELS)}
+            context.options = LIMITS
             context.thread_count = 1
             yield container, stream
     except FFmpegError as error:

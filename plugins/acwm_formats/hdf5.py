@@ -7,6 +7,7 @@ import functools
 import io
 import itertools
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -31,6 +32,7 @@ from acwm_formats.hdf5_layouts import (
     bounds_in,
     episode_groups,
     files_of,
+    identity,
     layout_of,
     open_hdf5,
     partial_groups,
@@ -57,6 +59,8 @@ from acwm_formats.timeline import (
     first_sound,
 )
 
+Identity = tuple[str, int]
+
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
@@ -69,7 +73,7 @@ class HDF5(Format):
         files = files_of(path)
         if not files:
             return False
-        with open_hdf5(first_sound(files, _closed)) as file:
+        with open_hdf5(first_sound(files, _opens(None)), None) as file:  # `read` refuses links
             return layout_of(file) is not None
 
     @guarded
@@ -100,14 +104,15 @@ class HDF5(Format):
             rate: Frames per second, if the files do not say it.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
-            follow_links: Whether links may lead out of the folder; those within files may not.
+            follow_links: Whether links may lead out of the folder, or of the only file.
         """
         root = Path(root)
         files = files_of(root)
         if not files:
             raise DataError(f"{root} is not an HDF5 file and contains none")
-        first = first_sound(files, _closed)
-        layout = _layout(first, video, actions, states)
+        within = None if follow_links else root
+        first = first_sound(files, _opens(within))
+        layout = _layout(first, within, video, actions, states)
         if rate is None and layout.rate is None:
             raise DataError(f"{first} does not state its frame rate: give --rate")
         stated = exact(rate) if rate else cast(Fraction, layout.rate)
@@ -121,8 +126,8 @@ class HDF5(Format):
         options = {"video": video, "actions": actions, "states": states, "rate": rate}
         options |= {"pixel_range": typed(pixel_range), "channels": channels}
         options["follow_links"] = follow_links
-        card = _card(first) if layout.name == "acwm" else None
-        splits = _splits(files, layout, reader)
+        card = _card(first, within) if layout.name == "acwm" else None
+        splits = _splits(files, within, layout, reader)
         return RecordedDataset(
             name=card.name if card else word(root),
             splits=splits,
@@ -132,7 +137,7 @@ class HDF5(Format):
             actions=_action(card, layout),
             state=card.state if card and states is None else None,
             instances=_instances(card),
-            notes=_notes(root, files, layout, splits, stated=rate is not None),
+            notes=_notes(root, files, within, layout, splits, stated=rate is not None),
             summary=card.summary if card else f"Recorded in the layout of {layout.name}",
         )
 
@@ -171,9 +176,15 @@ class HDF5(Format):
         return {"root": exported_example(folder, cls())}
 
 
-def _layout(path: Path, video: str | None, actions: str | None, states: str | None) -> ArrayLayout:
+def _layout(
+    path: Path,
+    within: Path | None,
+    video: str | None,
+    actions: str | None,
+    states: str | None,
+) -> ArrayLayout:
     """The layout of a file, with what the user says in the place of what is known."""
-    with open_hdf5(path) as file:
+    with open_hdf5(path, within) as file:
         known = layout_of(file)
     if known is None and (video is None or actions is None):
         raise DataError(
@@ -200,17 +211,19 @@ def _paths(text: str | None) -> dict[str, str]:
 
 def _splits(
     files: Sequence[Path],
+    within: Path | None,
     layout: ArrayLayout,
     reader: Callable[[dict[int, StoredEpisode]], Recordings],
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
     found: dict[Split | None, list[StoredEpisode]] = {}
     damaged: list[StoredEpisode] = []
+    known, own_files = set[Identity](), {os.path.realpath(path) for path in files}
     for path in files:
         try:
-            groups, tests = _contents(path, layout)
+            groups, tests = _contents(path, within, layout, known, own_files)
         except DataError as error:
-            damaged.append(StoredEpisode(HDF5Group(path, "/"), problem=str(error)))
+            damaged.append(StoredEpisode(HDF5Group(path, "/", within), problem=str(error)))
             continue
         own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
         for name, episodes in groups.items():
@@ -229,27 +242,42 @@ def _splits(
 
 
 def _contents(
-    path: Path, layout: ArrayLayout
+    path: Path,
+    within: Path | None,
+    layout: ArrayLayout,
+    known: set[Identity],
+    others: set[str],
 ) -> tuple[dict[str, list[StoredEpisode]], dict[str, Split] | None]:
-    """The episodes in a file by their group, and the groups that it sets aside for tests."""
-    with open_hdf5(path) as file:
-        names = episode_groups(file, layout)
-        groups = {name: [*_episodes(path, file, name, names, layout)] for name in names}
+    """The episodes in a file by their group, and the groups that it sets aside for tests.
+
+    Groups to which links lead are left out if they lie in one of the `others`, which are read, too,
+    or are `known`; those that are found are added.
+    """
+    with open_hdf5(path, within) as file:
+        names = [
+            name
+            for name in episode_groups(file, layout)
+            if (found := identity(file[name])) not in known
+            and (found[0] == os.path.realpath(path) or found[0] not in others)
+        ]
+        known |= {identity(file[name]) for name in names}
+        groups: dict[str, list[StoredEpisode]] = {}
+        for name in names:
+            alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
+            arrays = HDF5Group(path, name, within)
+            groups[name] = [*_episodes(arrays, file[name], layout, alone=alone)]
         if layout.is_robosuite and names:  # opening one will tell what it lacks
             for name in partial_groups(file, layout):
-                groups[name] = [StoredEpisode(HDF5Group(path, name))]
+                groups[name] = [StoredEpisode(HDF5Group(path, name, within))]
         return {name: groups[name] for name in sorted(groups, key=natural)}, _tests(file)
 
 
 def _episodes(
-    path: Path, file: Any, name: str, names: Sequence[str], layout: ArrayLayout
+    arrays: HDF5Group, group: Any, layout: ArrayLayout, *, alone: bool
 ) -> Iterator[StoredEpisode]:
     """The episodes in a group: one, or several in a row."""
-    arrays, bounds = HDF5Group(path, name), None
     try:
-        if layout.name != "acwm":
-            alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
-            bounds = _bounds(file[name], layout, alone=alone)
+        bounds = None if layout.name == "acwm" else _bounds(group, layout, alone=alone)
     except DataError as error:
         yield StoredEpisode(arrays, problem=str(error))
         return
@@ -272,6 +300,7 @@ def _bounds(group: Any, layout: ArrayLayout, *, alone: bool) -> Bounds | None:
 def _notes(
     root: Path,
     files: Sequence[Path],
+    within: Path | None,
     layout: ArrayLayout,
     splits: Recordings | Mapping[Split, Recordings],
     *,
@@ -281,11 +310,11 @@ def _notes(
     notes = [layout.note] if layout.note and not stated else []
     notes += unread_note(root, files)
     for path in () if layout.name == "acwm" or layout.is_robosuite else files:
-        with contextlib.suppress(DataError), open_hdf5(path) as file:
+        with contextlib.suppress(DataError), open_hdf5(path, within) as file:
             if lacking := partial_groups(file, layout):
                 what = " and ".join((layout.actions, *layout.cameras.values()))
                 notes.append(f"Groups of {path.name} without {what}: {', '.join(lacking[:5])}.")
-    with open_hdf5(first_sound(files, _closed)) as file:
+    with open_hdf5(first_sound(files, _opens(within)), within) as file:
         if names := episode_groups(file, layout):
             group = file[names[0]]
             others = [n for n in group if is_action(n) and n != layout.actions]
@@ -302,8 +331,9 @@ def _notes(
     return tuple(notes)
 
 
-def _closed(path: Path) -> None:
-    open_hdf5(path).close()
+def _opens(within: Path | None) -> Callable[[Path], None]:
+    """Opens a file and closes it, to find out whether it can be read."""
+    return lambda path: open_hdf5(path, within).close()
 
 
 def _tests(file: Any) -> dict[str, Split] | None:
@@ -326,9 +356,9 @@ def _instances(card: EnvironmentCard | None) -> tuple[str, ...]:
     return card.instances if card and len(card.instances) > 1 else ()
 
 
-def _card(path: Path) -> EnvironmentCard:
+def _card(path: Path, within: Path | None) -> EnvironmentCard:
     """The card in a file that acwm wrote."""
-    with open_hdf5(path) as file:
+    with open_hdf5(path, within) as file:
         try:
             return DatasetCard.from_dict(parse_json(file.attrs["card"])).environment
         except UNREADABLE as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator
 from fractions import Fraction
@@ -18,6 +19,7 @@ from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout
 from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, tells
 from acwm_formats.frames import MOST_FRAMES
+from acwm_formats.hdf5_links import check_references, external_links, open_plain
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import natural
 from acwm_formats.robosuite import robosuite
@@ -37,40 +39,35 @@ def files_of(path: Path) -> list[Path]:
     return files_in(path, ENDINGS)
 
 
-def open_hdf5(path: Path) -> Any:
-    """Open an HDF5 file that refers to no other.
+def open_hdf5(path: Path, within: Path | None) -> Any:
+    """Open an HDF5 file.
+
+    Args:
+        path: the file.
+        within: the folder, or the only file, that its references may not lead out of; None allows
+            any file, see `check_references`.
 
     Raises:
-        DataError: it is missing, damaged or has links to other files.
+        DataError: it is missing or damaged, or refers to other files.
     """
-    check_fetched(path)
+    file = open_plain(path)
     try:
-        file = h5py.File(path, "r")
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{path} cannot be read as HDF5 ({error})") from error
-    outside: list[str] = []
-    file.visititems_links(lambda name, link: _external(name, link, outside))
-    if outside:
+        check_references(file, within)
+    except BaseException:
         file.close()
-        raise DataError(f"{path} has a link to another file, {outside[0]}: copy that file into it")
+        raise
     return file
 
 
-def _external(name: str, link: Any, outside: list[str]) -> None:
-    if isinstance(link, h5py.ExternalLink):
-        outside.append(name)
-
-
 def array(group: Any, name: str) -> Any:
-    """The dataset `name` of a group, whose data lies in the same file.
+    """The dataset `name` of a group.
 
     Raises:
-        DataError: there is none.
+        DataError: there is none, or it claims more than is read.
     """
     found = group.get(name)
     if not isinstance(found, h5py.Dataset):
         raise DataError(f"{group.file.filename} has no array {group.name.rstrip('/')}/{name}")
-    _check_own(found)
     row = math.prod(found.shape[1:]) * found.dtype.itemsize
     if row > MOST_BYTES or found.shape[:1] > (MOST_FRAMES,):
         where = f"{found.name} in {group.file.filename}"
@@ -79,20 +76,14 @@ def array(group: Any, name: str) -> Any:
 
 
 def values_of(found: Any, rows: slice | tuple[()] = ()) -> Any:
-    """What a dataset holds, or some of its rows; its data lies in the same file.
+    """What a dataset holds, or some of its rows.
 
     Raises:
-        DataError: it lies in another.
         ValueError: it claims far more than the file stores.
     """
-    _check_own(found)
-    check_unpacked(found.id.get_storage_size(), found.size * found.dtype.itemsize)
+    stored = 0 if found.external else found.id.get_storage_size()  # which claims its own size
+    check_unpacked(stored, found.size * found.dtype.itemsize)
     return found[rows]
-
-
-def _check_own(found: Any) -> None:
-    if found.external or found.is_virtual:
-        raise DataError(f"{found.file.filename} keeps {found.name} in another file: copy it")
 
 
 def episode_groups(file: Any, layout: ArrayLayout) -> list[str]:
@@ -118,10 +109,32 @@ def partial_groups(file: Any, layout: ArrayLayout) -> list[str]:
 
 
 def _groups(file: Any) -> Iterator[str]:
-    yield "/"
-    names: list[str] = []
-    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Group) else None)
-    yield from names
+    """The groups of a file, and of others that it links to, each once."""
+    known: set[tuple[str, int]] = set()
+    waiting = [""]
+    while waiting:
+        name = waiting.pop(0)
+        group = file[name or "/"]
+        for inner, item in _below(group):
+            if identity(item) not in known:
+                known.add(identity(item))
+                yield f"{name}/{inner}".strip("/") or "/"
+        for inner, _ in external_links(group):
+            where = f"{name}/{inner}".strip("/")
+            if _is_group(item := file.get(where)) and identity(item) not in known:
+                waiting.append(where)
+
+
+def _below(group: Any) -> list[tuple[str, Any]]:
+    """A group and those below it in the same file, by their names in it."""
+    found = [("", group)]
+    group.visititems(lambda name, item: found.append((name, item)) if _is_group(item) else None)
+    return found
+
+
+def identity(item: Any) -> tuple[str, int]:
+    """What tells a group or dataset from all others: its file, and its place there."""
+    return os.path.realpath(item.file.filename), h5py.h5o.get_info(item.id).addr
 
 
 def layout_of(file: Any) -> ArrayLayout | None:

@@ -23,15 +23,16 @@ LONGEST = 1000  # characters of a text that is kept
 
 @dataclass(frozen=True)
 class HDF5Group(ArrayStore):
-    """The arrays in the group `name` of a file."""
+    """The arrays in the group `name` of a file; see `open_hdf5` for `within`."""
 
     path: Path
     name: str
+    within: Path | None
 
     @property
     def group(self) -> Any:
         """The group in its file, which stays open."""
-        return shared_file(self.path)[self.name]
+        return shared_file(self.path, self.within)[self.name]
 
     @property
     def title(self) -> str:
@@ -111,11 +112,11 @@ def texts(group: Any) -> dict[str, str]:
     return found
 
 
-def shared_file(path: Path) -> Any:
-    """An HDF5 file, which stays open while its episodes are read; errors as in `open_hdf5`."""
-    return _file(path, file_stamp(path))
+def shared_file(path: Path, within: Path | None) -> Any:
+    """An HDF5 file, which stays open while its episodes are read; as `open_hdf5`."""
+    return _file(path, within, file_stamp(path))
 
 
 @functools.lru_cache(maxsize=2)
-def _file(path: Path, _: str) -> Any:
-    return open_hdf5(path)
+def _file(path: Path, within: Path | None, _: str) -> Any:
+    return open_hdf5(path, within)

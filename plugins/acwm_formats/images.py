@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from acwm_core.data.video import MOST_PIXELS
 from acwm_core.errors import AcwmError, DataError
 from acwm_core.files import check_fetched
 
@@ -23,9 +24,6 @@ CHANNELS = (1, 3, 4)
 KINDS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 """Pictures that are read, by Pillow's names. Others that it opens are programs (EPS is run by
 Ghostscript), so the kinds are always named; the first bytes tell which one it is, not its name."""
-
-MOST_PIXELS = 2**26
-"""Pixels of a frame. Few bytes can claim more, and unpacking them would take all memory."""
 
 MOST_BYTES = 16 * MOST_PIXELS
 """Bytes of a frame in an array: four channels of four bytes."""

@@ -74,10 +74,11 @@ class Minari(Format):
             rate: Frames per second; by default those of the environment's spec, if it says them.
             pixel_range: Values that are black and white, e.g. 0,1.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
-            follow_links: Whether links may lead out of the folder; those within files may not.
+            follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
-        stored = _stored(root)
+        within = None if follow_links else root
+        stored = _stored(root, within)
         metadata, parts = stored.metadata, _parts(stored.observations)
         cameras = {name: space for name, space in parts.items() if _shows(space)}
         if video is not None and video not in cameras:
@@ -90,7 +91,7 @@ class Minari(Format):
         if said is None:
             raise DataError(f"{root} does not state its frame rate: give --rate")
         names = tuple(cameras) if video is None else (video,)
-        recordings = MinariRecordings(root, names, said, pair(pixel_range), channels)
+        recordings = MinariRecordings(root, names, said, pair(pixel_range), channels, within)
         return RecordedDataset(
             name=word(root.parent if root.name == "data" else root),
             splits=recordings,
@@ -133,25 +134,26 @@ class Minari(Format):
 
 @dataclass(frozen=True)
 class MinariRecordings:
-    """The episodes of a dataset, opened on request."""
+    """The episodes of a dataset, opened on request; see `open_hdf5` for `within`."""
 
     root: Path
     cameras: tuple[str, ...]
     rate: Fraction
     pixel_range: tuple[float, float] | None
-    channels: Channels | None = None
+    channels: Channels | None
+    within: Path | None
 
     def __len__(self) -> int:
         """The number of episodes."""
-        return len(_stored(self.root).episodes)
+        return len(_stored(self.root, self.within).episodes)
 
     def __getitem__(self, index: int) -> TimedRecording:
         """Open one episode: the observations, and an action from each to the next."""
-        stored = _stored(self.root)
+        stored = _stored(self.root, self.within)
         title = f"episode {stored.episodes[index].removeprefix('episode_')}"
         with damage_of(f"{title} of {self.root}"):
             read = _from_hdf5 if stored.kind == "hdf5" else _from_arrow
-            seen, taken = read(_data(self.root), stored, index)
+            seen, taken = read(_data(self.root), stored, index, self.within)
             cameras = {
                 name: self._frames(cast(Images, seen[name]), name, index) for name in self.cameras
             }
@@ -228,12 +230,12 @@ def _metadata(root: Path) -> dict[str, Any]:
         raise DataError(f"{path} cannot be read ({error})") from error
 
 
-def _stored(root: Path) -> _Stored:
-    return _described(root, file_stamp(_data(root) / METADATA))
+def _stored(root: Path, within: Path | None) -> _Stored:
+    return _described(root, within, file_stamp(_data(root) / METADATA))
 
 
 @functools.lru_cache(maxsize=2)
-def _described(root: Path, _: str) -> _Stored:
+def _described(root: Path, within: Path | None, _: str) -> _Stored:
     """What a dataset says about itself.
 
     Raises:
@@ -250,7 +252,9 @@ def _described(root: Path, _: str) -> _Stored:
         seen = deserialize_space(metadata["observation_space"])
         acts = deserialize_space(metadata["action_space"])
         claimed = int(metadata["total_episodes"])
-    names = [*shared_file(data / MAIN)] if kind == "hdf5" else [p.name for p in data.iterdir()]
+    names = (
+        [*shared_file(data / MAIN, within)] if kind == "hdf5" else [p.name for p in data.iterdir()]
+    )
     pattern = r"episode_\d+" if kind == "hdf5" else r"\d+"
     there = sorted((name for name in names if re.fullmatch(pattern, name)), key=natural)
     last = int(there[-1].removeprefix("episode_")) if there else -1
@@ -260,9 +264,11 @@ def _described(root: Path, _: str) -> _Stored:
     return _Stored(metadata, kind, seen, acts, tuple(there))
 
 
-def _from_hdf5(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:
+def _from_hdf5(
+    data: Path, stored: _Stored, index: int, within: Path | None
+) -> tuple[_Seen, NDArray[Any]]:
     """Observations and actions of an episode; images are read when they are asked for."""
-    arrays = HDF5Group(data / MAIN, stored.episodes[index])
+    arrays = HDF5Group(data / MAIN, stored.episodes[index], within)
     group = arrays.group
     is_dict, seen = isinstance(stored.observations, gymnasium.spaces.Dict), _Seen()
     for name, space in _parts(stored.observations).items():
@@ -276,7 +282,9 @@ def _from_hdf5(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[
     return seen, arrays.rows("actions")
 
 
-def _from_arrow(data: Path, stored: _Stored, index: int) -> tuple[_Seen, NDArray[Any]]:
+def _from_arrow(
+    data: Path, stored: _Stored, index: int, _: Path | None
+) -> tuple[_Seen, NDArray[Any]]:
     """Observations and actions of an episode, which is a folder of files; the last row has none."""
     dataset: Any = importlib.import_module("pyarrow.dataset")
     files = [str(path) for path in files_in(data / stored.episodes[index], [f".{stored.kind}"])]

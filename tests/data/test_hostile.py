@@ -9,6 +9,9 @@ from conftest import checksums
 from forging import forge, npy, problems, replaced, sign, zipped
 
 from acwm_core.data.card import MANIFEST
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.data.video import encode_masks, encode_video
+from acwm_core.errors import DataError
 from tests.plugins import Attack
 
 SHARD = "train/shard-00000.tar"
@@ -61,3 +64,17 @@ def test_states_under_names_that_lead_out_are_refused(data):
 def test_manifests_that_mislead_are_refused(data, change, problem):
     sign(data, **change)
     assert problem in refused(data, f"train/{MANIFEST}")
+
+
+@pytest.mark.parametrize("member", ["video.mkv", "mask.mkv"])
+@pytest.mark.parametrize(
+    ("shape", "problem"),
+    [((2, 256, 256), "its frames are 256×256, not 32×32"), ((400, 32, 32), "more than 22 frames")],
+)
+def test_videos_that_unpack_to_more_than_the_card_says(data, member, shape, problem):
+    encode = encode_video if member == "video.mkv" else encode_masks
+    frames = np.zeros((*shape, 3) if member == "video.mkv" else shape, np.uint8)
+    forge(data, replaced(f"{KEY}.{member}", encode(frames)))
+    assert problem in refused(data)
+    with pytest.raises(DataError, match=problem):
+        EpisodeDataset(data, "train")[1]

@@ -57,21 +57,6 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     assert not HDF5.detect(path)
 
 
-def test_a_file_that_refers_to_another_is_refused(tmp_path):
-    path, _ = arrays.robomimic(tmp_path, PLAIN)
-    (tmp_path / "secret").write_bytes(bytes(range(200)))
-    with h5py.File(path, "a") as file:
-        file["data/demo_0/obs/linked"] = h5py.ExternalLink("other.hdf5", "/x")
-    with pytest.raises(DataError, match="link to another file, data/demo_0/obs/linked"):
-        HDF5().read(path)
-    with h5py.File(path, "a") as file:
-        del file["data/demo_0/obs/linked"], file["data/demo_0/actions"]
-        outside = [(str(tmp_path / "secret"), 0, 64)]
-        file["data/demo_0"].create_dataset("actions", (8, 2), np.float32, external=outside)
-    with pytest.raises(DataError, match="keeps /data/demo_0/actions in another file"):
-        HDF5().read(path).splits[0]
-
-
 class Bomb:
     def __reduce__(self):
         return pytest.fail, ("code of a file was run",)
