@@ -42,8 +42,9 @@ def train_estimator(
     """Train a network that reads the states of your own world.
 
     DATA needs masks that name instances, and positions among its states. The command matches
-    positions to instances, fits the camera, and at the end prints the errors on other episodes;
-    `acwm new estimator NAME --weights FILE` makes a package of it.
+    positions to instances, uses the camera that the card declares, or else fits one, and at the end
+    prints the errors on other episodes; `acwm new estimator NAME --weights FILE` makes a package of
+    it.
     """
     from acwm_estimators.train_fitted import train_fitted  # imports torch
 

@@ -1,8 +1,8 @@
-"""What a network can read of one's own world, and a camera fitted to its masks and states.
+"""What a network can read of one's own world, and the camera that its card declares or data show.
 
-An environment of acwm has a layout and a camera of its own. Of any other dataset with masks and
-positions, this module finds which instance each position belongs to, and how positions in the
-world appear in the frame.
+An environment of acwm has a layout of its own. Of any other dataset with masks and positions, this
+module finds which instance each position belongs to, and, if the card declares no camera, how
+positions in the world appear in the frame.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.env.camera import Camera
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.physics import Physics, Reading
-from acwm_core.env.state_field import BodySymmetry
+from acwm_core.env.state_field import BodySymmetry, StateField
 from acwm_core.errors import DataError
 from acwm_estimators.camera import FittedCamera, with_ones
 from acwm_estimators.layout import Layout, Local, Points
+from acwm_estimators.targets import lifted
 
 Array = NDArray[np.float64]
 
@@ -41,6 +43,10 @@ FLAT = 0.02
 SAMPLES = 1500
 """Frames that a layout is found from."""
 
+AWAY = 0.15
+"""Median distance, in frame heights, between where a declared camera shows a position and its mask,
+above which it is another camera."""
+
 LEAST = 0.002
 """Share of the frame that a mask must cover for its middle to count."""
 
@@ -50,6 +56,8 @@ def fitted_layout(
 ) -> Layout:
     """What can be read of a dataset: all instances, and the positions that their masks show.
 
+    The camera and the owners of positions are those that the card declares, else fitted ones.
+
     Args:
         dataset: with masks and states.
         angles: fields with angles in rad to read as well, one for each row of a position, and
@@ -57,7 +65,8 @@ def fitted_layout(
         most: number of episodes to look at.
 
     Raises:
-        DataError: it has no masks, or no position that they show.
+        DataError: it has no masks, no position that they show, or was not seen by the camera that
+            its card declares.
     """
     card = dataset.card.environment
     if len(card.instances) < 2:
@@ -74,15 +83,17 @@ def fitted_layout(
     }
     points, pairs = list[Points](), list[tuple[Array, Array]]()
     for field in card.state:
-        if len(field.shape) not in (1, 2) or field.shape[-1] not in (2, 3):
+        if not _may_be_position(field):
             continue
         rows = np.asarray(states[field.name], np.float64).reshape(len(masks), -1, field.shape[-1])
-        owners = [_owner(rows[:, row], middles) for row in range(rows.shape[1])]
+        owners = _owners(field, rows, middles)
         if all(owners):
             names = tuple(name for name in owners if name)
-            plane = 0.0 if field.shape[-1] == 2 else None
+            plane = field.height if field.shape[-1] == 2 else None
             points.append(Points(field.name, names, plane, field.present))
             pairs += [(rows[:, row], middles[name]) for row, name in enumerate(names)]
+            if card.camera is not None:
+                _check_seen(card.camera, points[-1], pairs[-len(names) :])
     if not points:
         raise DataError(
             f"no position in the states of {dataset.path} follows a mask: its states are "
@@ -90,7 +101,8 @@ def fitted_layout(
             f"{', '.join(card.instances[1:])}"
         )
     locals_ = tuple(_angle(name, fold, points, card) for name, fold in (angles or {}).items())
-    return Layout(_camera(pairs), card.instances[1:], tuple(points), locals_)
+    camera = card.camera or _camera(pairs)
+    return Layout(camera, card.instances[1:], tuple(points), locals_)
 
 
 def fitted_physics(layout: Layout) -> Physics:
@@ -105,11 +117,12 @@ def fitted_physics(layout: Layout) -> Physics:
 
 
 def layout_from_dict(values: Mapping[str, Any]) -> Layout:
-    """A layout with a fitted camera, from its fields after a round trip through JSON."""
+    """The layout of `fitted_layout`, from its fields after a round trip through JSON."""
+    camera = values["camera"]
     return Layout(
-        FittedCamera(
-            *(tuple(map(tuple, values["camera"][name])) for name in ("matrix", "constant"))
-        ),
+        FittedCamera(*(tuple(map(tuple, camera[name])) for name in ("matrix", "constant")))
+        if "matrix" in camera
+        else Camera.from_dict(camera),
         tuple(values["instances"]),
         tuple(
             Points(each["field"], tuple(each["instances"]), each["plane"], each.get("present", ""))
@@ -142,6 +155,34 @@ def _middles(mask: NDArray[np.bool_], height: int, width: int) -> Array:
         middle = np.stack([mask.sum(1) @ x / counts, mask.sum(2) @ y / counts], -1)
     middle[counts < LEAST * height * width] = np.nan
     return middle
+
+
+def _may_be_position(field: StateField) -> bool:
+    """Whether a field has the numbers of positions, and is not declared to be something else."""
+    is_declared = field.kind == "position"
+    return (is_declared or field.kind == "value") and (
+        len(field.shape) in (1, 2) and field.shape[-1] in (2, 3)
+    )
+
+
+def _owners(field: StateField, rows: Array, middles: Mapping[str, Array]) -> list[str | None]:
+    """The instance of each row of a position: the declared one, or the one that it follows."""
+    if field.kind == "position" and field.owners:
+        return [*field.owners]
+    return [_owner(rows[:, row], middles) for row in range(rows.shape[1])]
+
+
+def _check_seen(camera: Camera, points: Points, pairs: Sequence[tuple[Array, Array]]) -> None:
+    """Refuse a camera that shows positions far from the masks of their bodies."""
+    for name, (values, middle) in zip(points.instances, pairs, strict=True):
+        seen = camera.to_frame(lifted(values, points.plane))[:, :2]
+        away = np.linalg.norm(seen - middle, axis=1)
+        there = np.isfinite(away)
+        if there.sum() >= FEWEST and (off := float(np.median(away[there]))) > AWAY:
+            raise DataError(
+                f"the camera that the card declares shows {points.field} {off:.2f} frame heights "
+                f"away from the mask of {name}: correct the camera, or declare none"
+            )
 
 
 def _owner(values: Array, middles: Mapping[str, Array]) -> str | None:

@@ -51,6 +51,8 @@ def train_fitted(
     """
     dataset = EpisodeDataset(data, "train")
     layout = fitted_layout(dataset, angles, episodes)
+    declared = dataset.card.environment.camera is not None
+    yield f"camera: {'as the card declares' if declared else 'fitted, as the card declares none'}"
     for points in layout.points:
         yield f"{points.field}: {', '.join(points.instances)}"
     torch.manual_seed(seed)

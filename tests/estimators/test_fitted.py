@@ -1,7 +1,8 @@
 """Estimators of one's own world: the fitted camera and layout, and the whole way to one."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,15 @@ from click.testing import CliRunner
 from acwm_core.cli import main
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
+from acwm_core.env.camera import Camera
+from acwm_core.env.card import StateField
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import as_clip
 from acwm_estimators.estimator import FittedEstimator
 from acwm_estimators.fitted import _camera, fitted_layout, layout_from_dict
+from acwm_estimators.targets import seen_points
 from tests import tiny
+from tests.tiny import Drift
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +76,57 @@ def test_data_without_masks_or_positions_is_refused(drift, tmp_path):
         fitted_layout(EpisodeDataset(tmp_path / "few", "train"), most=1)
     with pytest.raises(DataError, match="there is no state 'yaw', but position"):
         fitted_layout(EpisodeDataset(drift, "train"), {"yaw": 4})
+
+
+CAMERA = Camera((0.0, -2.0, 1.5), (0.0, 0.0, 0.2), fov=50)
+
+
+class Masts(list):
+    """Episodes of a mast that stands at a place on a table; its mask is what rises above it."""
+
+    path = "data/masts"
+
+    def __init__(self, camera, **declared):
+        field = StateField("foot", (2,), "m", "on the table", height=0.1, **declared)
+        environment = replace(
+            Drift.card, camera=camera, state=(field,), instances=("ground", "mast")
+        )
+        self.card = SimpleNamespace(environment=environment)
+        rng = np.random.default_rng(0)
+        feet = rng.uniform(-0.5, 0.5, (3, 20, 2))
+        super().__init__(
+            SimpleNamespace(masks=np.stack([*map(drawn, f)]), states={"foot": f}) for f in feet
+        )
+
+
+def drawn(foot):
+    """The mask of a mast of 0.3 m."""
+    mask = np.zeros((32, 32), np.uint8)
+    for height in np.linspace(0.1, 0.4, 30):
+        x, y, _ = CAMERA.project(np.array([*foot, height]), 32, 32)
+        mask[int(y) - 1 : int(y) + 1, int(x) - 1 : int(x) + 1] = 1
+    return mask
+
+
+@pytest.mark.parametrize("declared", [{}, {"kind": "position", "instances": ("mast",)}])
+def test_positions_lie_where_the_declared_camera_says(declared):
+    layout = fitted_layout(Masts(CAMERA, **declared))
+    (points,) = layout.points
+    assert (points.instances, points.plane) == (("mast",), 0.1)
+    foot = np.array([[[0.3, -0.2]]])
+    seen = seen_points({"foot": foot[0]}, points, layout.camera)
+    pixel = CAMERA.project(np.array([0.3, -0.2, 0.1]), 32, 32)
+    np.testing.assert_allclose(seen[0, 0, :2] * 32 + 16, pixel[:2], atol=1e-6)
+    np.testing.assert_allclose(layout.camera.on_plane(seen[..., :2], 0.1)[..., :2], foot, atol=1e-6)
+    assert layout_from_dict(json.loads(json.dumps(asdict(layout)))) == layout
+    fitted = seen_points({"foot": foot[0]}, points, fitted_layout(Masts(None, **declared)).camera)
+    assert np.linalg.norm(fitted[0, 0, :2] * 32 + 16 - pixel[:2]) > 1  # it knows the masks alone
+
+
+def test_a_camera_that_did_not_see_the_data_is_refused():
+    other = replace(CAMERA, eye=(2.0, 0.0, 1.5))
+    with pytest.raises(DataError, match=r"the camera .* shows foot .* away from the mask of mast"):
+        fitted_layout(Masts(other, kind="position", instances=("mast",)))
 
 
 @pytest.mark.ci
