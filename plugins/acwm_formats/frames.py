@@ -36,7 +36,7 @@ MOST_FRAMES = 10**7
 """Frames of a recording: four days at 30 per second."""
 
 OPENING = {"max_pixels": str(2 * MOST_PIXELS)}
-"""Options of FFmpeg while a file is opened: of what it accepts, `check_pixels` says what is wrong."""
+"""Options of FFmpeg as it opens a file, whose size `check_pixels` can name then."""
 
 MOST_UNPACKED = 2**32
 """Pixels that a video may always unpack to."""
@@ -273,7 +273,7 @@ def opened_video(path: Path) -> Generator[tuple[Any, Any]]:
     place = str(path.absolute())  # "concat:a" would be a protocol of FFmpeg
     try:
         with av.open(
-            place, "r", format=kind, metadata_errors="replace", options=LIMITS
+            place, "r", format=kind, metadata_errors="replace", options=OPENING
         ) as container:
             if not container.streams.video:
                 raise DataError(f"{path} holds no video")
