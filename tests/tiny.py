@@ -21,7 +21,7 @@ from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.model.build import build_world_model
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import Denoiser, LatentStream, Predictor
+from acwm_core.model.dynamics import Denoiser, Keypoints, LatentStream, Predictor
 from acwm_core.model.objectives.full_sequence import FullSequence
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
@@ -331,10 +331,30 @@ class Blind(Exact):
     blind = True
 
 
+class Sighted(Exact):
+    """Says where it sees the square, and beside it a keypoint for which no picture cares."""
+
+    keypoint_names = ("square", "nothing")
+
+    def read_keypoints(self, latents):
+        places = (corners_seen(latents.flatten(0, 1)) + SIDE / 2).flip(1) / 16 - 1
+        values = torch.stack([places, torch.zeros_like(places)], 1).unflatten(0, latents.shape[:2])
+        return Keypoints(values, torch.tensor([[1.0, 1.0], [0.0, 0.0]]), torch.tensor([1.0, 0.0]))
+
+    def predict_keypoints(self, given, conditioning, frames, generators=()):
+        given = given.expand(len(conditioning.modulation), -1, -1, -1, -1)
+        return self.read_keypoints(self(given, conditioning, frames))
+
+
+def corners_seen(latents):
+    """The corners `[N, 2]` that latent frames `[N, C, 4, 4]` show in their last video frame."""
+    shown = nn.functional.pixel_shuffle(latents, 8).unflatten(1, (STRIDE, 3))[:, -1]
+    return corners_of(shown).float()
+
+
 class _ExactStream(LatentStream):
     def __init__(self, given, blind):
-        shown = nn.functional.pixel_shuffle(given[:, -1], 8).unflatten(1, (STRIDE, 3))[:, -1]
-        self._corners, self._blind = corners_of(shown).float(), blind
+        self._corners, self._blind = corners_seen(given[:, -1]), blind
 
     def advance(self, conditioning):
         frames = []
@@ -394,7 +414,13 @@ Plugin = plugin_of(
     environments=targets(drift="Drift", tiny_world="TinyWorld", slide="Slide", unread="Unread"),
     estimators=targets(slide="SquareEstimator"),
     codecs=targets(blocks="BlockCodec", tiny_codec="TinyCodec"),
-    models=targets(linear="PointwiseModel", tiny_model="TinyModel", exact="Exact", blind="Blind"),
+    models=targets(
+        linear="PointwiseModel",
+        tiny_model="TinyModel",
+        exact="Exact",
+        blind="Blind",
+        sighted="Sighted",
+    ),
     conditioners=targets(
         linear="SumConditioner", raw="RawConditioner", tiny_conditioner="TinyConditioner"
     ),

@@ -35,6 +35,7 @@ from acwm_core.evaluation.score import (
     quick_metrics,
     score,
 )
+from acwm_core.evaluation.tracks import tracks_of
 from acwm_core.evaluation.videos import ShownClip, pick_clips, shown
 from acwm_core.model.shapes import Actions, Video
 from acwm_core.model.world_model import Mode
@@ -279,9 +280,12 @@ class Evaluator:
                 start = f"-{clip.start:04d}" if clip.start else ""
                 file = f"{clip.split}-{clip.episode:06d}{start}-{each.kind}.mp4"
                 own = values[*place, each.kind]
-                videos.append(
-                    shown(each, file, kind=each.kind, pick=pick, actions=actions, values=own)
+                record, frames = shown(
+                    each, file, kind=each.kind, pick=pick, actions=actions, values=own
                 )
+                if each.kind == "model":
+                    record = replace(record, tracks=tracks_of(self.world_model, each))
+                videos.append((record, frames))
         return videos
 
     def _swept(self, clips: Sequence[Clip]) -> list[Clip]:

@@ -250,6 +250,27 @@ class SplitSummary:
 
 
 @dataclass(frozen=True)
+class Tracks:
+    """Where a model sees things in the true frames of a clip, and where it expects them.
+
+    Places are right and down, from 0 to 1 within the picture; None where it sees nothing.
+
+    Attributes:
+        names: of the N things.
+        shares: how much the picture changes with each, as a share of the one that counts most.
+        every: video frames from one row to the next.
+        seen: in the true frames, read each by itself, `[L, N, 2]`.
+        predicted: in the prediction, `[L, N, 2]`; those of the given frames are seen.
+    """
+
+    names: list[str]
+    shares: list[float]
+    every: int
+    seen: list[list[list[float | None]]]
+    predicted: list[list[list[float | None]]]
+
+
+@dataclass(frozen=True)
 class VideoRecord:
     """A video of one clip: truth, prediction, difference and the truth over the prediction.
 
@@ -265,6 +286,8 @@ class VideoRecord:
         values: its scores by metric.
         actions: the actions that the model was given, `[T, A]`.
         panels: what its panels show, row by row.
+        tracks: of the things that the model sees; None if it sees none, or other actions were
+            taken.
     """
 
     file: VideoFile
@@ -277,6 +300,7 @@ class VideoRecord:
     actions: list[list[float]]
     start: int = 0
     panels: list[list[str]] = field(default_factory=lambda: [["truth", "prediction", "difference"]])
+    tracks: Tracks | None = None
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,22 @@ class ModelInputs(NamedTuple):
     states: tuple[str, ...] = ()
 
 
+class Keypoints(NamedTuple):
+    """Where a model sees N things in the picture, and what they look like to it.
+
+    Attributes:
+        values: in L latent frames, `[B, L, N, D]`: the place, right and down, each from -1 to 1 in
+            the picture, and then D − 2 features of the model's own; NaN where it sees none.
+        weights: how much the picture changes with each number, `[N, D]`; the unit is the model's.
+        shares: how much the picture changes with all that is usual of a keypoint, as a share of the
+            one that counts most, `[N]`, 0 to 1.
+    """
+
+    values: Tensor
+    weights: Tensor
+    shares: Tensor
+
+
 class DynamicsModel(nn.Module, ABC):
     """A network that an objective trains to predict latent frames from embedded actions.
 
@@ -196,7 +212,13 @@ class Predictor(DynamicsModel):
     Other models leave them unused.
 
     Only `forward` is required. The other methods are further abilities.
+
+    Attributes:
+        keypoint_names: the things that `read_keypoints` and `predict_keypoints` see, in their
+            order; none if the model has no such ability.
     """
+
+    keypoint_names: tuple[str, ...] = ()
 
     @abstractmethod
     def forward(
@@ -261,6 +283,30 @@ class Predictor(DynamicsModel):
             RecipeError: the model predicts no states.
         """
         raise RecipeError(f"{type(self).__name__} predicts no states")
+
+    def read_keypoints(self, latents: Latent) -> Keypoints:
+        """Where it sees things in latent frames `[B, L, C, h, w]`, each by itself. Optional.
+
+        Raises:
+            RecipeError: the model sees no keypoints.
+        """
+        raise RecipeError(f"{type(self).__name__} sees no keypoints")
+
+    def predict_keypoints(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[Generator] = (),
+    ) -> Keypoints:
+        """Where it expects them in the L − K latent frames after the given ones. Optional.
+
+        The arguments are those of `predict_states`.
+
+        Raises:
+            RecipeError: the model sees no keypoints.
+        """
+        raise RecipeError(f"{type(self).__name__} sees no keypoints")
 
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[Generator] = ()

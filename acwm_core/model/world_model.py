@@ -13,7 +13,7 @@ from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.batch import Batch
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import DynamicsModel, Predictor, hidden_matrices
+from acwm_core.model.dynamics import DynamicsModel, Keypoints, Predictor, hidden_matrices
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels, float32_by_default
 from acwm_core.model.stream import Stream, continued
@@ -182,6 +182,45 @@ class WorldModel(nn.Module):
             named[name] = part.reshape(*values.shape[:2], *shape)
             start += math.prod(shape)
         return named
+
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """The things whose place in the picture the model knows; see `Predictor`."""
+        return self.model.keypoint_names if isinstance(self.model, Predictor) else ()
+
+    @torch.no_grad()
+    def read_keypoints(self, video: Video) -> Keypoints:
+        """Where the model sees things in a video `[B, T, 3, H, W]`, in each latent frame.
+
+        Raises:
+            RecipeError: the model sees no keypoints.
+        """
+        return self._seeing().read_keypoints(self.codec.encode(self._given(video)))
+
+    @torch.no_grad()
+    def predict_keypoints(
+        self, given: Frame | Video, actions: Actions, *, seeds: Sequence[int] | None = None
+    ) -> Keypoints:
+        """Where the model expects them in the latent frames after the given ones.
+
+        The arguments are those of `predict_states`.
+
+        Raises:
+            RecipeError: the model sees no keypoints.
+        """
+        model, video = self._seeing(), self._given(given)
+        length = self.codec.latent_frames(actions.shape[1])
+        return model.predict_keypoints(
+            self.codec.encode(video),
+            self.condition(actions, length),
+            length,
+            _generators(video, len(actions), seeds),
+        )
+
+    def _seeing(self) -> Predictor:
+        if not isinstance(self.model, Predictor) or not self.model.keypoint_names:
+            raise RecipeError(f"{type(self.model).__name__} sees no keypoints")
+        return self.model
 
     @property
     def predicts_states(self) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import get_args
@@ -21,7 +20,6 @@ from acwm_core.data.video import write_mp4
 from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import (
-    AcwmWarning,
     DataError,
     RecipeError,
     ShapeError,
@@ -39,13 +37,10 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle, load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_dream.captions import enlarged
-from acwm_formats.images import KINDS, opened_picture
+from acwm_formats.images import picture_of_size
 
 COLUMNS = 8
 """Most frames of a strip."""
-
-SQUEEZED = 0.02
-"""A picture whose sides have another ratio than the frames, by so much, is not used silently."""
 
 Panels = tuple[NDArray[np.uint8], ...]
 """The panels of one frame, `[H, W, 3]` each."""
@@ -157,7 +152,7 @@ def _read_start(image: Path, bundle: RunBundle) -> Clip:
     context = bundle.world_model.context_frames
     if context > 1:
         raise RecipeError(f"this model starts from {context} frames, but --image gives one")
-    return _read_image(image, bundle.card.frame_size)[None]
+    return as_clip(picture_of_size(image, bundle.card.frame_size)[None])
 
 
 def _with_chosen(
@@ -235,21 +230,6 @@ def _simulate_episode(
         raise DataError(f"no simulator of {name} is installed: give a dataset of it with --data")
     simulated = simulate(make_environment(name, card.options), card.spec(split, episode))
     return as_clip(simulated.video), simulated.actions
-
-
-def _read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
-    """Read a picture as `[3, H, W]` in [0, 1]."""
-    height, width = size
-    with opened_picture(path, (*KINDS, "GIF")) as picture:
-        if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
-            warnings.warn(
-                f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
-                "pixels: crop it first to keep its proportions",
-                AcwmWarning,
-                stacklevel=2,
-            )
-        resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
-    return torch.tensor(np.asarray(resized)).permute(2, 0, 1).float() / 255
 
 
 def _read_actions(path: Path, spec: ActionSpec) -> NDArray[np.float32]:

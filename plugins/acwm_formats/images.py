@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from acwm_core.data.video import MOST_PIXELS
-from acwm_core.errors import AcwmError, DataError
+from acwm_core.errors import AcwmError, AcwmWarning, DataError
 from acwm_core.files import check_fetched
 
 CHANNELS = (1, 3, 4)
@@ -27,6 +27,9 @@ Ghostscript), so the kinds are always named; the first bytes tell which one it i
 
 MOST_BYTES = 16 * MOST_PIXELS
 """Bytes of a frame in an array: four channels of four bytes."""
+
+SQUEEZED = 0.02
+"""A picture whose sides have another ratio than the frames, by so much, is not used silently."""
 
 _DAMAGED = (
     *(OSError, ValueError, SyntaxError, EOFError, LookupError, TypeError, ArithmeticError),
@@ -145,6 +148,25 @@ def read_image(source: Path | bytes) -> NDArray[Any]:
     """
     with opened_picture(source) as opened:
         return _stored(opened)
+
+
+def picture_of_size(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Read a picture as a frame `[H, W, 3]` of this size; warns if it gets other proportions.
+
+    Raises:
+        DataError: see `opened_picture`.
+    """
+    height, width = size
+    with opened_picture(path, (*KINDS, "GIF")) as picture:
+        if abs(picture.height * width / (picture.width * height) - 1) > SQUEEZED:
+            warnings.warn(
+                f"{path} is squeezed from {picture.height}×{picture.width} to {height}×{width} "
+                "pixels: crop it first to keep its proportions",
+                AcwmWarning,
+                stacklevel=2,
+            )
+        resized = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+    return np.asarray(resized)
 
 
 @contextlib.contextmanager

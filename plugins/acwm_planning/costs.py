@@ -15,6 +15,9 @@ from acwm_core.recipe.trust import import_named
 from acwm_planning.planner import Cost, Futures
 from acwm_planning.predicted import NotPredicted, PredictedStates
 
+TINY = 1e-6
+"""Square of a distance that counts as none, so that a gradient is known there."""
+
 
 def last_frames(length: int, frames: int | None) -> list[int]:
     """Choose `frames` evenly spaced latent frames of `length`, including the last; None means all.
@@ -114,6 +117,44 @@ class StateDistance(Cost):
         mean = np.where(finite.any(1), mean, mean.max(initial=0))
         penalty = self.unknown * (1 - finite.mean(1)) + self.failure * failed
         return torch.from_numpy(mean + penalty).float()
+
+
+class KeypointDistance(Cost):
+    """Distance of the model's keypoints from those that it reads in the goal's picture.
+
+    The sum over keypoints of the distance of their places and features, each number weighted by how
+    much the picture changes with it; the mean over frames. It needs neither states nor an
+    estimator, and the task only for its goal. A keypoint that is not seen does not count.
+
+    Args:
+        frames: number of latent frames to judge, evenly spaced and including the last; null for
+            all.
+        features: weight of what keypoints look like, beside where they are; 0 compares places
+            alone.
+
+    Raises:
+        RecipeError: a negative weight.
+    """
+
+    def __init__(self, *, frames: int | None = 3, features: float = 1.0) -> None:
+        if not features >= 0:
+            raise RecipeError(f"cost.features is {features}; it must be 0 or more")
+        self.frames, self.features = frames, features
+        last_frames(1, frames)
+
+    def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
+        """See `Cost`. The unit is a usual deviation of a keypoint that counts."""
+        expected = futures.keypoints(last_frames(futures.length, self.frames))
+        wanted = futures.keypoints_of(goal.frame)
+        if expected is None or wanted is None:
+            raise RecipeError(
+                "this model sees no points to compare: take cost=latent, or train one that does, "
+                "such as by +points"
+            )
+        weights = expected.weights.clone()
+        weights[:, 2:] *= self.features
+        apart = ((expected.values - wanted.values) * weights).nan_to_num(0)
+        return (apart.square().sum(-1) + TINY).sqrt().sum(2).mean(1)
 
 
 class UserCost(Cost):

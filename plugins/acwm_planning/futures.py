@@ -22,7 +22,7 @@ from acwm_core.errors import DataError, RecipeError, check_shape
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.batch import Batch
 from acwm_core.model.codec import Codec
-from acwm_core.model.dynamics import Predictor
+from acwm_core.model.dynamics import Keypoints, Predictor
 from acwm_core.model.precision import bfloat16_is_fast
 from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
@@ -82,6 +82,8 @@ class ModelFutures(Futures):
         stills: pictures and their latent frames, encoded before; shared within a decision.
         states: of the planned video frames, `[N, T, S]`, if the model predicts them.
         shapes: shapes of their fields.
+        expects: where the model expects things in the planned latent frames, if it sees any.
+        reads: where it sees them in latent frames `[1, 1, C, h, w]`.
     """
 
     def __init__(
@@ -96,6 +98,8 @@ class ModelFutures(Futures):
         stills: list[tuple[Frame, Latent]],
         states: Callable[[], Tensor] | None = None,
         shapes: Mapping[str, tuple[int, ...]] | None = None,
+        expects: Callable[[], Keypoints] | None = None,
+        reads: Callable[[Latent], Keypoints] | None = None,
     ) -> None:
         self._codec, self._given, self._past, self._predict = codec, given, past, predict
         self._last, self._estimator, self._stills = last, estimator, stills
@@ -103,12 +107,17 @@ class ModelFutures(Futures):
         self._states, self._shapes = states, shapes or {}
         self._latents: dict[int, Latent] = {}
         self._predicted_states: Tensor | None = None
+        self._expects, self._reads = expects, reads
+        self._keypoints: Keypoints | None = None
 
     @property
     def finite(self) -> Tensor:
         """Which candidates' predictions are finite, `[N]`, in what was asked for."""
-        if self._predicted_states is not None and not self._latents:
-            return _finite_states(self._predicted_states)
+        if not self._latents:
+            if self._predicted_states is not None:
+                return _finite_states(self._predicted_states)
+            if self._keypoints is not None:
+                return _finite_states(self._keypoints.values.detach().flatten(2))
         self.latents([self.length - 1])
         latents = torch.stack(list(self._latents.values()), 1)
         return latents.detach().isfinite().flatten(1).all(1)
@@ -172,6 +181,21 @@ class ModelFutures(Futures):
         states = self._predicted_states[:, video_frames].flatten(0, 1)
         return predicted_observation(states.cpu(), self._shapes)
 
+    def keypoints(self, frames: Sequence[int]) -> Keypoints | None:
+        """They carry a gradient if the actions do, and are predicted once."""
+        if self._expects is None:
+            return None
+        if self._keypoints is None:
+            self._keypoints = self._expects()
+        return self._keypoints._replace(values=self._keypoints.values[:, list(frames)])
+
+    def keypoints_of(self, picture: Frame) -> Keypoints | None:
+        """Those that the model reads in the latent frame of a still picture."""
+        if self._reads is None:
+            return None
+        with torch.no_grad():
+            return self._reads(self.still(picture))
+
     def still(self, picture: Frame) -> Latent:
         """Each picture is encoded once per decision."""
         for encoded, latent in self._stills:
@@ -180,6 +204,12 @@ class ModelFutures(Futures):
         latent = still_latent(self._codec, picture, self._given.device)
         self._stills.append((picture, latent))
         return latent
+
+
+def reads_of(world_model: WorldModel) -> Callable[[Latent], Keypoints] | None:
+    """What reads keypoints in latent frames; None if the model sees none."""
+    model = world_model.model
+    return cast(Predictor, model).read_keypoints if world_model.keypoint_names else None
 
 
 def _finite_states(states: Tensor) -> Tensor:
@@ -302,9 +332,15 @@ class ModelRollouts:
         def states() -> Tensor:
             return self._predict_states(given, actions, seed)[:, past * stride :]
 
+        def expected() -> Keypoints:
+            with torch.set_grad_enabled(actions.requires_grad):
+                found = self._predict_keypoints(given, actions, seed)
+            return found._replace(values=found.values[:, past:])
+
         latents = given.latents.expand(len(actions), -1, -1, -1, -1)
         world = self.world_model
         own = states if world.predicts_states else None
+        expects = expected if world.keypoint_names else None
         futures = ModelFutures(
             codec,
             latents,
@@ -316,6 +352,8 @@ class ModelRollouts:
             stills,
             own,
             world.state_shapes,
+            expects,
+            reads_of(world),
         )
         model = world.model
         if not (isinstance(model, Predictor) and model.implements("predict_frames")):
@@ -337,6 +375,12 @@ class ModelRollouts:
         begin, length = self._begun(given, actions, seed)
         model = cast(Predictor, self.world_model.model)
         return model.predict_states(given.latents, begin.conditioning, length, begin.generators)
+
+    def _predict_keypoints(self, given: _Given, actions: Actions, seed: int) -> Keypoints:
+        """In the latent frames after the given ones."""
+        begin, length = self._begun(given, actions, seed)
+        model = cast(Predictor, self.world_model.model)
+        return model.predict_keypoints(given.latents, begin.conditioning, length, begin.generators)
 
     def _begun(self, given: _Given, actions: Actions, seed: int) -> tuple[Batch, int]:
         """The beginning of the candidates' clips, and their number of latent frames."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Frame, Goal, Task
+from acwm_core.model.dynamics import Keypoints
 from acwm_core.model.shapes import Actions, Latent, Video
 
 RolloutCost = Callable[[Actions], Tensor]
@@ -69,6 +70,15 @@ class Futures(ABC):
 
         No picture is made. States that it does not predict raise `NotPredicted` when accessed.
         """
+        return None
+
+    def keypoints(self, frames: Sequence[int]) -> Keypoints | None:
+        """Where the model expects things in these frames, `[N, len(frames), K, D]`; None if it sees
+        none. No picture is made."""
+        return None
+
+    def keypoints_of(self, picture: Frame) -> Keypoints | None:
+        """Where the model sees things in a picture, `[1, 1, K, D]`; None if it sees none."""
         return None
 
     @abstractmethod

@@ -62,6 +62,11 @@ def register_costs(registry: Registry) -> None:
         summary="the task's distance, of states that an estimator reads",
     )
     registry.add(
+        "points",
+        "acwm_planning.costs:KeypointDistance",
+        summary="distance of the points that a model sees to those in the goal's picture",
+    )
+    registry.add(
         "callable",
         "acwm_planning.costs:UserCost",
         summary="your own function: cost.function=module:name",

@@ -34,7 +34,7 @@ from acwm_planning.episode import (
     spec_of_seed,
     start_of,
 )
-from acwm_planning.futures import ModelRollouts
+from acwm_planning.futures import ModelRollouts, reads_of
 from acwm_planning.left_out import passed_over
 from acwm_planning.planner import Cost, Planner
 from acwm_planning.results import VIDEOS, PlanTable
@@ -137,7 +137,8 @@ class EpisodePlayer:
             self._branches = self._make_environment()
         codec = self._world.codec
         estimator = self._estimator if coded else None
-        return SimulatorRollouts(self._branches, codec.temporal_stride, codec, estimator)
+        reads = reads_of(self._world)
+        return SimulatorRollouts(self._branches, codec.temporal_stride, codec, estimator, reads)
 
     def _make_environment(self) -> Environment:
         return make_environment(self.card.name, {"size": self.card.frame_size})

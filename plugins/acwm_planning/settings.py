@@ -61,7 +61,7 @@ class Settings:
     @property
     def estimates(self) -> bool:
         """Whether the cost may need states, which an estimator reads."""
-        return self.cost["name"] != "latent"
+        return self.cost["name"] not in ("latent", "points")
 
     @property
     def differentiates(self) -> bool:
@@ -75,7 +75,8 @@ class Settings:
     def rows(self, names: Collection[str]) -> list[str]:
         """The rows to play of those that are asked for, in the order of `ROW_NAMES`.
 
-        A cost on latents is the same through the codec, so then there is no such row.
+        A cost on latents, or of what is read in them, is the same through the codec, so then there
+        is no such row.
 
         Raises:
             RecipeError: there is no such row.

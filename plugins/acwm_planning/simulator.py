@@ -15,6 +15,7 @@ from acwm_core.env.task import Frame, observed
 from acwm_core.errors import RecipeError
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.codec import Codec
+from acwm_core.model.dynamics import Keypoints
 from acwm_core.model.shapes import Actions, Latent, Video
 from acwm_planning.futures import GoalCost, History, still_latent
 from acwm_planning.planner import Futures, RolloutCost
@@ -34,6 +35,7 @@ class SimulatorFutures(Futures):
         codec: encodes frames as latents, as if they stood still; None if no latents are needed.
         estimator: with it, states are read from the codec's reconstructions of the frames, which
             shows what codec and estimator alone lose. Without it, states are the true ones.
+        reads: where a model sees things in latent frames, for costs that compare these.
     """
 
     def __init__(
@@ -44,9 +46,10 @@ class SimulatorFutures(Futures):
         stride: int,
         codec: Codec | None,
         estimator: StateEstimator | None = None,
+        reads: Callable[[Latent], Keypoints] | None = None,
     ) -> None:
         self._environment, self._history, self._codec = environment, history, codec
-        self._estimator = estimator
+        self._estimator, self._reads = estimator, reads
         self._actions = actions.detach().cpu().numpy()
         self._ends = [*range(stride, actions.shape[1], stride), actions.shape[1]]
         self.length = len(self._ends)
@@ -73,6 +76,17 @@ class SimulatorFutures(Futures):
 
     def predicted(self, frames: Sequence[int]) -> Observation:
         return self.observe(frames)
+
+    def keypoints(self, frames: Sequence[int]) -> Keypoints | None:
+        return None if self._reads is None else self._read(self.latents(frames))
+
+    def keypoints_of(self, picture: Frame) -> Keypoints | None:
+        return None if self._reads is None else self._read(self.still(picture))
+
+    @torch.no_grad()
+    def _read(self, latents: Latent) -> Keypoints:
+        assert self._reads is not None
+        return self._reads(latents)
 
     def still(self, picture: Frame) -> Latent:
         if self._codec is None:
@@ -117,6 +131,7 @@ class SimulatorRollouts:
         stride: number of actions between two frames that costs may look at.
         codec: codec of the latents, if a cost needs them.
         estimator: see `SimulatorFutures`.
+        reads: see `SimulatorFutures`.
     """
 
     def __init__(
@@ -125,9 +140,10 @@ class SimulatorRollouts:
         stride: int,
         codec: Codec | None = None,
         estimator: StateEstimator | None = None,
+        reads: Callable[[Latent], Keypoints] | None = None,
     ) -> None:
         self.environment, self._stride, self._codec = environment, stride, codec
-        self._estimator = estimator
+        self._estimator, self._reads = estimator, reads
 
     def cost(
         self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
@@ -136,7 +152,8 @@ class SimulatorRollouts:
 
         def cost(actions: Actions) -> Tensor:
             futures = SimulatorFutures(
-                self.environment, history, actions, self._stride, self._codec, self._estimator
+                *(self.environment, history, actions, self._stride, self._codec),
+                *(self._estimator, self._reads),
             )
             return goal_cost(futures, len(actions))
 

@@ -47,22 +47,37 @@ class Opening:
 
 def opening(run: EvaluatedRun, videos: Sequence[EmbeddedVideo]) -> Opening | None:
     """The median clip of the first split, or what is nearest to it; None without videos."""
+    own = _typical_first(run, videos)
+    return _opening(run, own[0], PANELS) if own else None
+
+
+def tracked(run: EvaluatedRun, videos: Sequence[EmbeddedVideo]) -> list[Opening]:
+    """The most typical clip of each split in which the model sees things."""
+    found: dict[str, EmbeddedVideo] = {}
+    for each in _typical_first(run, videos):
+        if each.record.tracks and each.record.tracks.names:
+            found.setdefault(each.record.split, each)
+    return [_opening(run, each, PANELS[:2]) for each in found.values()]
+
+
+def _typical_first(run: EvaluatedRun, videos: Sequence[EmbeddedVideo]) -> list[EmbeddedVideo]:
     splits = [*run.summary.splits]
-    own = [each for each in videos if each.record.kind == "model"]
     rank = {"median": 0, "worst": 1, "best": 2}
-    own.sort(key=lambda v: (splits.index(v.record.split), rank.get(v.record.pick, 3)))
-    if not own:
-        return None
-    record = own[0].record
+    own = [each for each in videos if each.record.kind == "model"]
+    return sorted(own, key=lambda v: (splits.index(v.record.split), rank.get(v.record.pick, 3)))
+
+
+def _opening(run: EvaluatedRun, video: EmbeddedVideo, names: Sequence[str]) -> Opening:
+    record = video.record
     places = {
         name: Pane(name, row, column)
-        for row, names in enumerate(record.panels)
-        for column, name in enumerate(names)
+        for row, of_row in enumerate(record.panels)
+        for column, name in enumerate(of_row)
     }
     about = f"{record.pick} clip by {run.headline.title}, {split_title(record.split).lower()}"
     height, width = run.summary.provenance["dataset"]["frame_size"]
-    panes = [places[name] for name in PANELS if name in places]
-    return Opening(own[0], about[0].upper() + about[1:], panes, (height, width))
+    panes = [places[name] for name in names if name in places]
+    return Opening(video, about[0].upper() + about[1:], panes, (height, width))
 
 
 def main_figures(run: EvaluatedRun) -> list[Figure]:

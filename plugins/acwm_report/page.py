@@ -22,12 +22,13 @@ from acwm_report.comparison import run_labels
 from acwm_report.experiment import experiment_tables
 from acwm_report.export import file_name, templates, to_csv, to_latex, to_markdown
 from acwm_report.figures import Chart
-from acwm_report.opening import main_figures, opening
+from acwm_report.opening import main_figures, opening, tracked
 from acwm_report.plan_videos import VideoRoom, plan_videos, task_videos
 from acwm_report.reproduce import commands
 from acwm_report.run import EvaluatedRun, of_readable, read_runs
 from acwm_report.scores import main_table
 from acwm_report.table import Table
+from acwm_report.tracks import tracks
 from acwm_report.videos import MEGABYTES, action_traces, embed_videos
 
 FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
@@ -214,6 +215,8 @@ def _page_templates() -> Any:
         figures_of=main_figures,
         opening_of=opening,
         split_title=titles.split_title,
+        tracked_of=tracked,
+        tracks_of=tracks,
         version=acwm_core.__version__,
     )
     return pages

@@ -18,8 +18,22 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("run", type=RUN)
-@click.argument("task")
+@click.argument("task", required=False)
 @click.argument("overrides", nargs=-1)
+@click.option(
+    "--goal",
+    type=click.Path(path_type=Path),
+    help="Instead of TASK: plan to what this picture shows, without a simulator.",
+)
+@click.option(
+    "--start", type=click.Path(path_type=Path), help="With --goal: a picture to start from."
+)
+@click.option(
+    "--episode",
+    type=int,
+    help="Instead of TASK or --start: start as this recorded test episode does; without --goal, "
+    "to the frame that it reaches in the time of a plan.",
+)
 @click.option("--seeds", default="0", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/planning/TASK by default.")
 @click.option(
@@ -44,8 +58,11 @@ if TYPE_CHECKING:
 @click.option("--device", default="auto", help="Device of the model: cpu, cuda, cuda:1, …")
 def plan(
     run: Path,
-    task: str,
+    task: str | None,
     overrides: tuple[str, ...],
+    goal: Path | None,
+    start: Path | None,
+    episode: int | None,
     seeds: tuple[int, ...],
     out: Path | None,
     compare: bool,
@@ -61,7 +78,16 @@ def plan(
     really happened. OVERRIDES change the settings: planner=cem planner.candidates=300 cost=state
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
+
+    With --goal or --episode, it makes one plan to a picture, writes its actions and what the model
+    imagines of them, and executes nothing: so it works with recordings.
     """
+    if task is None or "=" in task or goal or episode is not None:
+        words = [word for word in (task, *overrides) if word is not None]
+        plan_to_picture(run, words, preset, goal, start, episode, out, device)
+        return
+    if start:
+        raise click.UsageError("--start belongs to --goal: leave out TASK, or --start")
     from acwm_planning.settings import ROW_NAMES, settings_of, words_of
 
     # reports misspelt settings and rows before the slow import of torch
@@ -106,6 +132,54 @@ def plan(
         progress=True,
     )
     print_page_table(write_plan_page(where))
+    click.echo(where)
+
+
+def plan_to_picture(
+    run: Path,
+    words: Sequence[str],
+    preset: str,
+    goal: Path | None,
+    start: Path | None,
+    episode: int | None,
+    out: Path | None,
+    device: str,
+) -> None:
+    """Make one plan to a picture, and say what it is worth."""
+    from acwm_planning.settings import settings_of, words_of
+
+    if named := [word for word in words if "=" not in word]:
+        raise click.UsageError(f"give the task {named[0]}, or --goal and --episode")
+    if goal is None and episode is None:
+        raise click.UsageError("give a TASK, or --goal PICTURE (or --episode N) for recordings")
+    if (start is None) == (episode is None):
+        raise click.UsageError("a plan starts from --start PICTURE or from --episode N: give one")
+    settings_of(words, preset)  # reports misspelt settings before the slow import of torch
+
+    from acwm_core.training.run import load_run
+    from acwm_formats.images import picture_of_size
+    from acwm_planning.pictures import PicturePlanner, begin_of, write_plan
+    from acwm_planning.run import action_std_of
+
+    bundle = load_run(run)
+    own = ["cost=points"] if bundle.world_model.keypoint_names else []
+    settings = settings_of(words, preset, own)
+    click.echo(f"settings: {' '.join(words_of(settings.to_dict()))}")
+    planner = PicturePlanner(bundle, settings, device, action_std_of(run))
+    size = bundle.card.frame_size
+    if start is not None:
+        frames, actions = [picture_of_size(start, size)], []
+    else:
+        ahead = settings.planner.get("horizon", 5) * settings.planner.get("action_block", 4)
+        data = bundle.recipe.data["path"]
+        frames, actions, reached = begin_of(bundle, data, episode or 0, goal is None, ahead)
+    made = planner.plan(frames, actions, picture_of_size(goal, size) if goal else reached)
+    where = out or run / "planning" / "picture"
+    write_plan(where, made, bundle.card)
+    click.echo(
+        f"{len(made.actions)} actions whose imagined cost is {made.cost:.3g}; without motion it is "
+        f"{made.still_cost:.3g}"
+    )
     click.echo(where)
 
 

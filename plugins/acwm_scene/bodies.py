@@ -10,13 +10,14 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from acwm_core.model.batch import to_device
+from acwm_core.model.dynamics import Keypoints
 from acwm_scene.agent_sight import cell_places
 from acwm_scene.body_motion import HIDDEN, AgentMotion, BodyMotion, Moving
 from acwm_scene.body_painter import BodyPainter
 from acwm_scene.body_sight import BodySight, pose_distance, pose_loss, sight_loss
 from acwm_scene.body_windows import moving_windows
 from acwm_scene.declared import GroupSpec, unit_of
-from acwm_scene.group import SteppedGroup, at_frame, energy_score, stacked
+from acwm_scene.group import SteppedGroup, at_frame, declared_keypoints, energy_score, stacked
 from acwm_scene.nodes import View
 from acwm_scene.poses import Poses, angle_between, direction, turned_back
 
@@ -121,6 +122,20 @@ class BodyGroup(SteppedGroup):
     def with_draw(self, state: Moving, draw: Tensor) -> Moving:
         """The state with the numbers of each body that its future depends on."""
         return state._replace(chance=(draw.unflatten(1, (self.spec.bodies, -1)),))
+
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """Agents and bodies, by their numbers."""
+        agents = (f"agent {number + 1}" for number in range(self.spec.agents))
+        return (*agents, *(f"body {number + 1}" for number in range(self.spec.bodies)))
+
+    def keypoints(self, course: Poses, aspect: float) -> Keypoints:
+        """Their places on the plane as the camera sees them; NaN of bodies that are not there."""
+        bodies = course.places
+        if self.spec.has_presence:
+            bodies = bodies.where(course.present > 0.5, math.nan)
+        places = torch.cat([course.agents, bodies], -2)
+        return declared_keypoints(self.view(places, aspect)[..., :2])
 
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by agents and video frames; see `AgentMotion.embed`."""

@@ -10,10 +10,15 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.utils import _pytree
 
+from acwm_core.model.dynamics import Keypoints
 from acwm_core.model.shapes import Latent
 
 Tree = TypeVar("Tree")
 """A tensor, or a named tuple, tuple or dict of trees."""
+
+DECLARED_WEIGHT = 4.0
+"""Weight of the places of declared things as keypoints: as if they usually were a quarter of half
+the picture apart, as the weights of learnt points count in standard deviations."""
 
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
@@ -41,6 +46,12 @@ def picked(course: Tree, numbers: Tensor) -> Tree:
 def flattened(course: Tree) -> Tree:
     """The first two axes as one."""
     return tree_map(lambda values: values.flatten(0, 1), course)
+
+
+def declared_keypoints(places: Tensor) -> Keypoints:
+    """Keypoints at places `[B, T, N, 2]` of declared things, which all count alike."""
+    weights = places.new_full(places.shape[2:], DECLARED_WEIGHT)
+    return Keypoints(places, weights, torch.ones_like(weights[:, 0]))
 
 
 def energy_score(
@@ -102,6 +113,20 @@ class Group(nn.Module, ABC):
     def with_draw(self, state: Any, draw: Tensor) -> Any:
         """The state with the numbers `[B, noise]` that its future depends on, as its `chance`."""
         return state._replace(chance=(draw,))
+
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """The things whose place in the picture it knows, if it does."""
+        return ()
+
+    def keypoints(self, course: Any, aspect: float) -> Keypoints:
+        """Where they are in a course; for groups with `keypoint_names`.
+
+        Args:
+            course: `[B, T, …]`.
+            aspect: width of the picture by its height.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def embed(self, modulation: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,8 +11,9 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from acwm_core.model.batch import to_device
+from acwm_core.model.dynamics import Keypoints
 from acwm_scene.declared import GroupSpec, unit_of
-from acwm_scene.group import SteppedGroup, energy_score
+from acwm_scene.group import SteppedGroup, declared_keypoints, energy_score
 from acwm_scene.node_motion import NodeMotion
 from acwm_scene.node_painter import NodePainter
 from acwm_scene.node_sight import NodeSight, form_loss
@@ -121,6 +123,18 @@ class NodeGroup(SteppedGroup):
     def frame(self, state: Nodes) -> Form:
         """The form of a state."""
         return state.form
+
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """Agents, and the nodes that are moved, by their numbers."""
+        agents = (f"agent {number + 1}" for number in range(self.layout.agents))
+        nodes = range(math.prod(self.layout.shape))
+        return (*agents, *(f"node {number + 1}" for number in nodes))
+
+    def keypoints(self, course: Form, aspect: float) -> Keypoints:
+        """Their places as the camera sees them."""
+        places = torch.cat([course.agents, course.nodes], -2)
+        return declared_keypoints(self.sight.view(places, aspect)[..., :2])
 
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by video frames; see `ValueMotion.embed`."""

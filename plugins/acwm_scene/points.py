@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from acwm_core.model.batch import to_device
+from acwm_core.model.dynamics import Keypoints
 from acwm_scene.group import Group, energy_score, stacked
 from acwm_scene.point_motion import PointMotion, Points
 from acwm_scene.point_painter import PointPainter
@@ -109,6 +110,16 @@ class PointGroup(Group):
     def frame(self, state: Points) -> Tensor:
         """The points of a state."""
         return state.points
+
+    @property
+    def keypoint_names(self) -> tuple[str, ...]:
+        """The points, by their numbers."""
+        return tuple(f"point {number + 1}" for number in range(self.shape[0]))
+
+    def keypoints(self, course: Tensor, aspect: float) -> Keypoints:
+        """The points, whose places are in the picture already, with what drawing cares for."""
+        costs = (self.weight * self.motion.std).norm(dim=1)
+        return Keypoints(course, self.weight, costs / costs.max().clamp(min=1e-9))
 
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by latent frames; see `PointMotion.embed`."""

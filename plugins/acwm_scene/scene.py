@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Generator, Tensor, nn
+from torch.nn import functional
 from torch.utils import _pytree
 
 from acwm_core.env.card import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.batch import noise_of_clips, to_device
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import LatentStream, ModelInputs, Predictor
+from acwm_core.model.dynamics import Keypoints, LatentStream, ModelInputs, Predictor
 from acwm_core.model.shapes import Latent
 from acwm_scene.declared import GroupSpec, default_states, groups_of
 from acwm_scene.group import Group, at_frame, flattened, picked, stacked, tree_map
@@ -122,6 +123,9 @@ class SceneDynamics(Predictor):
         for name, group in made.items():
             self.groups.add_module(name, group)
         self.drawing = FrameDrawing(latent_channels, channels=channels, width=width, blocks=blocks)
+        self.keypoint_names = tuple(
+            name for group in made.values() for name in group.keypoint_names
+        )
         self.noise = sum(group.noise for group in made.values())
         self.samples = self.noise > 0
 
@@ -240,14 +244,32 @@ class SceneDynamics(Predictor):
                 "these weights do not hold the scale of their states, as an earlier version made "
                 "them, so no states can be predicted: train further by training.init_from"
             )
-        actions = self.embed(conditioning)
-        number = len(next(iter(actions.values())))
-        scene = self.read(given)
-        if len(given) < number:
-            scene = tree_map(lambda values: values.expand(number, *values.shape[1:]), scene)
-        scene = self._with_draw(scene, self._drawn(given, generators))
-        courses = self._moved(scene, actions, given.shape[1], frames)
-        return self.decode(courses)[:, 1:]
+        return self.decode(self._foretold(given, conditioning, frames, generators))[:, 1:]
+
+    def read_keypoints(self, latents: Latent) -> Keypoints:
+        """Where the things of its groups are; see `Predictor.read_keypoints`."""
+        frames, aspect = latents.flatten(0, 1)[:, None], latents.shape[4] / latents.shape[3]
+        courses = {
+            name: tree_map(
+                lambda values: values.unflatten(0, latents.shape[:2]),
+                group.frame(group.read(frames)),
+            )
+            for name, group in self._groups()
+            if group.keypoint_names
+        }
+        return self._keypoints(courses, aspect)
+
+    def predict_keypoints(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[Generator] = (),
+    ) -> Keypoints:
+        """Where they are when it has moved them; see `Predictor.predict_keypoints`."""
+        courses = self._foretold(given, conditioning, frames, generators)
+        later = tree_map(lambda values: values[:, self.stride :: self.stride], courses)
+        return self._keypoints(later, given.shape[4] / given.shape[3])
 
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[Generator] = ()
@@ -432,6 +454,44 @@ class SceneDynamics(Predictor):
         scene = self._with_draw(self.read(given), self._drawn(given, generators))
         courses = self._moved(scene, self.embed(conditioning), given.shape[1], frames)
         return self._drawn_courses(scene, courses, numbers)
+
+    def _foretold(
+        self,
+        given: Latent,
+        conditioning: Conditioning,
+        frames: int,
+        generators: Sequence[Generator],
+    ) -> dict[str, Any]:
+        """The courses `[B, 1 + T, …]` from the last given frame on; see `predict_states`."""
+        actions = self.embed(conditioning)
+        number = len(next(iter(actions.values())))
+        scene = self.read(given)
+        if len(given) < number:
+            scene = tree_map(lambda values: values.expand(number, *values.shape[1:]), scene)
+        scene = self._with_draw(scene, self._drawn(given, generators))
+        return self._moved(scene, actions, given.shape[1], frames)
+
+    def _keypoints(self, courses: Mapping[str, Any], aspect: float) -> Keypoints:
+        """Those of all groups; where one has fewer features, 0 without a weight."""
+        found = [
+            group.keypoints(courses[name], aspect)
+            for name, group in self._groups()
+            if group.keypoint_names
+        ]
+        if not found:
+            raise RecipeError("this scene knows only values, of which it sees no place")
+        size = max(each.values.shape[-1] for each in found)
+
+        def together(parts: Iterable[Tensor], axis: int) -> Tensor:
+            return torch.cat(
+                [functional.pad(each, (0, size - each.shape[-1])) for each in parts], axis
+            )
+
+        return Keypoints(
+            together((each.values for each in found), 2),
+            together((each.weights for each in found), 0),
+            torch.cat([each.shares for each in found]),
+        )
 
     def _begun(self, base: Tensor, states: dict[str, Any]) -> Scene:
         features = self.drawing.stem(base)

@@ -12,8 +12,15 @@ import torch
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal
 from acwm_core.errors import AcwmError, RecipeError
+from acwm_core.model.dynamics import Keypoints
 from acwm_core.plugins import catalog
-from acwm_planning.costs import LatentDistance, StateDistance, UserCost, last_frames
+from acwm_planning.costs import (
+    KeypointDistance,
+    LatentDistance,
+    StateDistance,
+    UserCost,
+    last_frames,
+)
 from acwm_planning.planner import Cost, Futures
 from acwm_planning.predicted import predicted_observation
 from tests import tiny
@@ -190,3 +197,31 @@ def test_what_the_documents_show_works():
 
     gently = code("docs/planning.md", "gently")
     assert gently(Seen(PLACES), tiny.PLACE, GOAL).tolist() == [0, pytest.approx(4.243, 1e-3), 0]
+
+
+class Seen(Known):
+    """Of a model that sees two keypoints: one where the candidate is, and one that rests."""
+
+    def keypoints(self, frames):
+        values = torch.tensor(self.places[:, list(frames)]).float()
+        values = torch.stack([torch.nn.functional.pad(values, (0, 1)), torch.zeros(3, 4, 3)], 2)
+        return Keypoints(values, torch.tensor([[1.0, 1, 5], [1, 1, 1]]), torch.ones(2))
+
+    def keypoints_of(self, picture):
+        values = torch.tensor([[14.0, 14, 1], [math.nan, 0, 0]])[None, None]
+        return Keypoints(values, torch.ones(2, 3), torch.ones(2))
+
+
+def test_points_count_by_their_weights_and_not_where_they_are_not_seen():
+    found = KeypointDistance(frames=None, features=0)(Seen(PLACES), None, GOAL)
+    far = [0, math.hypot(3, 3), 3 * math.hypot(6, 6) / 4]
+    torch.testing.assert_close(found, torch.tensor(far), atol=5e-3, rtol=0)
+    found = KeypointDistance(frames=None)(Seen(PLACES), None, GOAL)
+    assert float(found[0]) == pytest.approx(5, abs=5e-3)  # the feature is off by 1 of weight 5
+
+
+def test_a_model_without_points_has_none_to_compare():
+    with pytest.raises(RecipeError, match="sees no points to compare: take cost=latent"):
+        KeypointDistance()(Known(PLACES), tiny.PLACE, GOAL)
+    with pytest.raises(RecipeError, match=r"cost\.features is -1; it must be 0 or more"):
+        KeypointDistance(features=-1)

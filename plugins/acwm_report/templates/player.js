@@ -26,8 +26,20 @@ if (player) {
     }
   }
 
+  // Each dot follows its places, which are evenly spread over the video; NaN where nothing is seen.
+  function trace(figure) {
+    const movie = movieOf(figure), at = movie.duration ? movie.currentTime / movie.duration : 0;
+    for (const dot of figure.querySelectorAll("circle")) {
+      dot.places ??= dot.dataset.places.split(" ").map((each) => each.split(",").map(Number));
+      const when = at * (dot.places.length - 1), [before, after] = [Math.floor(when), Math.ceil(when)].map((each) => dot.places[each]);
+      const [x, y] = before.map((from, axis) => from + (when % 1) * (after[axis] - from));
+      dot.style.display = x === x ? "" : "none";
+      if (x === x) [["cx", x], ["cy", y]].forEach((each) => dot.setAttribute(...each));
+    }
+  }
+
   function draw(figure) {
-    if (figure.dataset.of) return panels(figure);
+    if (figure.dataset.of) return panels(figure), trace(figure);
     const movie = movieOf(figure), now = figure.querySelector(".now");
     const at = movie.duration ? movie.currentTime / movie.duration : 0;
     for (const end of now ? ["x1", "x2"] : []) now.setAttribute(end, at);
