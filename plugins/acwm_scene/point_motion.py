@@ -81,7 +81,7 @@ class PointMotion(nn.Module):
         self.register_buffer("std", torch.ones(points, entries))
         self.actions = nn.Linear(width, ACTION)
         self.chance = nn.Linear(noise, ACTION, bias=False) if noise else None
-        self.core, self.start = nn.Linear(size, CORE), nn.Linear(size, HIDDEN)
+        self.core, self.start = nn.Linear(size, CORE), nn.Linear(2 * size, HIDDEN)
         self.gru = nn.GRUCell(ACTION + CORE, HIDDEN)
         self.change = nn.Sequential(
             nn.Linear(HIDDEN + ACTION + CORE, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, CORE)
@@ -92,7 +92,7 @@ class PointMotion(nn.Module):
         )
         self.identity = nn.Parameter(torch.randn(points, IDENTITY))
         own = IDENTITY + entries
-        self.remember = nn.Linear(own, MEMORY)
+        self.remember = nn.Linear(own + entries, MEMORY)
         self.apart = nn.Linear(waves_size(2, OCTAVES), CHANNELS)
         self.receiver, self.sender = (nn.Linear(own + MEMORY + ACTION, CHANNELS) for _ in range(2))
         self.message = nn.Linear(CHANNELS, CHANNELS)
@@ -108,18 +108,19 @@ class PointMotion(nn.Module):
         with torch.autocast(modulation.device.type, enabled=False):  # errors add up
             return self.actions(modulation.float())
 
-    def begin(self, points: Tensor) -> Points:
-        """The state of points `[B, K, 2 + F]` at rest."""
+    def begin(self, points: Tensor, change: Tensor) -> Points:
+        """The state of points `[B, K, 2 + F]` that changed so since the latent frame before."""
         values = ((points - self.mean) / self.std).flatten(1)
         core, scene = self.core(values), self.by_scene(values)
-        memory = torch.tanh(self.remember(self._own(points)))
+        change = change / self.std
+        memory = torch.tanh(self.remember(torch.cat([self._own(points), change], -1)))
         return Points(
             points,
             given=points,
             scene=scene,
             led=self._led(core, scene),
             core=core,
-            hidden=torch.tanh(self.start(values)),
+            hidden=torch.tanh(self.start(torch.cat([values, change.flatten(1)], 1))),
             pushed=torch.zeros_like(points),
             memory=memory,
         )

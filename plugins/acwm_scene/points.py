@@ -98,14 +98,14 @@ class PointGroup(Group):
         return course.flatten(-2)
 
     def read(self, given: Tensor) -> Points:
-        """The points that the last given frame shows, at rest."""
+        """The points that the last given frame shows, and how they changed before it."""
         points = self.sight(given[:, -1])
-        return self.begin(points, points)
+        return self.begin(points, self.sight(given[:, -2]) if given.shape[1] > 1 else points)
 
     def begin(self, frame: Tensor, previous: Tensor) -> Points:
-        """The state of points at rest."""
+        """The state of points that were as in `previous` in the latent frame before."""
         with torch.autocast(frame.device.type, enabled=False):
-            return self.motion.begin(frame.float())
+            return self.motion.begin(frame.float(), (frame - previous).float())
 
     def frame(self, state: Points) -> Tensor:
         """The points of a state."""
@@ -168,6 +168,7 @@ class PointGroup(Group):
         first = int(torch.randint(last - frames + 1, (), generator=random))
         if torch.rand((), generator=random) < 0.4:
             first = 0
+        change = course[:clips, first] - course[:clips, max(0, first - 1)]
         course, actions = course[:clips, first:][:, : frames + 1], actions[:clips]
         noise = to_device(torch.randn(course[:, 0].shape, generator=random), course)
         with torch.autocast(states.device.type, enabled=False):
@@ -175,12 +176,12 @@ class PointGroup(Group):
             rows = actions[:, first + 1 :][:, :frames]
             later = self.weight * course[:, 1:]
             if not self.noise:
-                moved = self.weight * self._moved(start, rows)
+                moved = self.weight * self._moved(start, change, rows)
                 return functional.smooth_l1_loss(moved, later, beta=0.05)
             size = (len(start), self.noise)
             draws = tuple(
                 self.weight
-                * self._moved(start, rows, to_device(torch.randn(size, generator=random), start))
+                * self._moved(start, change, rows, to_device(torch.randn(size, generator=random), start))
                 for _ in range(2)
             )
             return energy_score((draws[0], draws[1]), later, point_distance)
@@ -189,10 +190,10 @@ class PointGroup(Group):
         """What moves points."""
         return (self.motion,)
 
-    def _moved(self, start: Tensor, actions: Tensor, *chance: Tensor) -> Tensor:
+    def _moved(self, start: Tensor, change: Tensor, actions: Tensor, *chance: Tensor) -> Tensor:
         """The points after each of the actions `[B, H, ACTION]`, `[B, H, K, 2 + F]`."""
         moved: list[Tensor] = []
-        state = self.motion.begin(start)._replace(chance=chance)
+        state = self.motion.begin(start, change)._replace(chance=chance)
         for action in actions.unbind(1):
             state = self.motion(action, state)
             moved.append(state.points)
