@@ -9,15 +9,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from acwm_scene.poses import waves, waves_size
-from acwm_scene.value_layers import HIDDEN
 
 ACTION = 32
 """Values that tell of the actions of a latent frame."""
 
+HIDDEN = 96
+"""Size of what moves the core, and of its layers: 256 overfitted on 272 episodes."""
+
 CORE = 32
 """Numbers that actions move, and that points may follow."""
 
-IDENTITY, MEMORY, CHANNELS, OCTAVES = 16, 48, 64, 4
+IDENTITY, MEMORY, CHANNELS, OCTAVES = 16, 48, 32, 3
 """Of the interaction of points: numbers that tell one point from another, the size of what each
 remembers, that of the hidden layers, and frequencies in which distances are seen."""
 

@@ -29,7 +29,7 @@ WINDOWS = ((0.35, 2), (0.7, 5))
 """Until which share of the training motion is learned from windows of so many latent frames; then
 from whole clips, in which errors add up."""
 
-MOVED_FRAMES, FEWEST_CLIPS = 512, 24
+MOVED_FRAMES, FEWEST_CLIPS = 288, 24
 """Most latent frames that a step of motion moves, of all its clips, and the fewest clips."""
 
 ALIVE = 0.08
