@@ -26,6 +26,9 @@ NOT_RESUMABLE = (
     "than one that was not interrupted; data.reader=random_access resumes with the very next clip"
 )
 
+FEWEST_EPISODES = 30
+"""Fewer teach little of what actions do, as measured on three worlds in findings/data-amount.md."""
+
 ROUNDING = 1e-6
 """Share of the largest value of a field by which float32 and a solver move what stands still."""
 
@@ -116,10 +119,22 @@ class ClipData(L.LightningDataModule):
 
     def setup(self, stage: str) -> None:
         """Encode clips that are not encoded yet, each rank a part on its device; open the clips."""
+        if len(self._split[0]) < FEWEST_EPISODES and not self.config.growing:
+            self._warn_of_few()
         if self._cached:
             self._encode()
         self._train = self._training_clips()
         self._validation = self._clips(self._split[1], self._stride, cached=self._cached)
+
+    def _warn_of_few(self) -> None:
+        if not self.trainer or self.is_first_process:
+            warnings.warn(
+                f"{self.episodes.path} has {len(self._split[0])} episodes to train on: from fewer "
+                f"than {FEWEST_EPISODES} a model learns what the scene looks like, but little of "
+                "what the actions do",
+                AcwmWarning,
+                stacklevel=2,
+            )
 
     @property
     def device(self) -> torch.device:

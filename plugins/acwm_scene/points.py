@@ -181,7 +181,9 @@ class PointGroup(Group):
             size = (len(start), self.noise)
             draws = tuple(
                 self.weight
-                * self._moved(start, change, rows, to_device(torch.randn(size, generator=random), start))
+                * self._moved(
+                    start, change, rows, to_device(torch.randn(size, generator=random), start)
+                )
                 for _ in range(2)
             )
             return energy_score((draws[0], draws[1]), later, point_distance)

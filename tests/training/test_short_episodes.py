@@ -6,6 +6,7 @@ import torch
 from acwm_core.data.clips import DataConfig
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import ActionSpec
+from acwm_core.errors import AcwmWarning
 from acwm_core.training.data import ClipData
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run
@@ -59,3 +60,14 @@ def test_rollouts_and_samples_use_several_held_out_episodes(short, tiny_parts):
     video, actions = data.sample(3)  # of episodes of 6, 9, 8, 5, 9 and 6 frames
     assert video.shape[:2] == actions.shape[:2] == (3, 7)
     assert data.sample(0)[0].shape[0] == 0
+
+
+def test_too_few_episodes_to_learn_from_are_reported(short, tiny_parts, monkeypatch, recwarn):
+    config = DataConfig(path=str(short), validation_episodes=6, cache_latents=False)
+    data = ClipData(config, EpisodeDataset(short, "train"), TinyCodec(), seed=0)
+    with pytest.warns(AcwmWarning, match=r"has 4 episodes to train on"):
+        data.setup("fit")
+    recwarn.clear()
+    monkeypatch.setattr("acwm_core.training.data.FEWEST_EPISODES", 4)
+    data.setup("fit")
+    assert not recwarn.list
