@@ -459,11 +459,12 @@ class Catalog:
         for point in self._entry_points():
             with self._reporting(point):
                 loaded.append((point, point.load()))
+        name_of = functools.cache(lambda distribution: distribution and distribution.name)
         for point, plugin in sorted(
             loaded, key=lambda each: not hasattr(each[1], "register_kinds")
         ):
-            with self._reporting(point):
-                self.add_plugin(plugin, point.name, point.dist.name if point.dist else None)
+            with self._reporting(point):  # a distribution reads its file again for each answer
+                self.add_plugin(plugin, point.name, name_of(point.dist))
 
     @contextlib.contextmanager
     def _reporting(self, point: importlib.metadata.EntryPoint) -> Generator[None]:

@@ -81,7 +81,7 @@ def references_file(
         "measures": measure_facts(evaluator.metrics, estimator),
         "options": [evaluator.config.metrics, evaluator.config.metric_options],
         "code": hashes,
-        "installed": sorted(f"{each.name} {each.version}" for each in distributions()),
+        "installed": installed_packages(),
     }
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     return cached(f"{episodes.split}-{key[:16]}.parquet")
@@ -100,6 +100,13 @@ def _files(episodes: EpisodeDataset) -> list[Any]:
     shards = [folder / shard_name(number) for number in range(len(episodes.shards))]
     states = [path.stat() if path.exists() else None for path in shards]
     return [str(folder), *(each and (each.st_size, each.st_mtime_ns) for each in states)]
+
+
+@cache
+def installed_packages() -> list[str]:
+    """Name and version of everything that is installed; reading that takes most of a second."""
+    found = (each.metadata for each in distributions())
+    return sorted(f"{facts['Name']} {facts['Version']}" for facts in found)
 
 
 @cache

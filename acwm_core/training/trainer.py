@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -97,8 +98,7 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         RecipeError: an unknown flag, a wrong type, or a class that cannot be imported or created.
     """
-    parser = cast(Any, ArgumentParser(exit_on_error=False))
-    parser.add_class_arguments(L.Trainer, "trainer", instantiate=False)
+    parser = _parser()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -108,6 +108,14 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
         raise RecipeError(f"invalid section trainer: {one_line(error)}") from None
     values = cast(dict[str, Any], made["trainer"].as_dict())
     return {name: values[name] for name in flags}
+
+
+@functools.cache
+def _parser() -> Any:
+    """Knows the flags of Lightning's Trainer and their types."""
+    parser = cast(Any, ArgumentParser(exit_on_error=False))
+    parser.add_class_arguments(L.Trainer, "trainer", instantiate=False)
+    return parser
 
 
 def one_line(error: BaseException) -> str:

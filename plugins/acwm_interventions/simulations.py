@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +18,7 @@ from acwm_core.data.simulate import simulate
 from acwm_core.env.environment import Environment
 from acwm_core.env.episode import Episode, EpisodeSpec
 from acwm_core.errors import DataError
-from acwm_core.evaluation.references import cached, package_hash
+from acwm_core.evaluation.references import cached, installed_packages, package_hash
 
 
 class Again(NamedTuple):
@@ -67,8 +66,8 @@ def _versions(environment: Environment) -> dict[str, Any]:
     """Everything that decides what the simulator makes of a spec; None for what has no hash."""
     packages = {base.__module__.partition(".")[0] for base in type(environment).__mro__[:-1]}
     code = {name: package_hash(name) for name in sorted(packages - {"abc", "typing"})}
-    installed = sorted(f"{each.name} {each.version}" for each in distributions())
-    return {**code, "installed": hashlib.sha256(json.dumps(installed).encode()).hexdigest()}
+    installed = json.dumps(installed_packages())
+    return {**code, "installed": hashlib.sha256(installed.encode()).hexdigest()}
 
 
 def _read(file: Path, asked: Sequence[Again], made_by: Mapping[str, Any]) -> list[Episode]:

@@ -138,7 +138,7 @@ def test_the_name_changes_with_whatever_the_rows_depend_on(own, monkeypatch):
     monkeypatch.setattr(references, "package_hash", lambda name: "other code")
     others.append(name())
     monkeypatch.undo()
-    monkeypatch.setattr(references, "distributions", lambda: [])
+    monkeypatch.setattr(references, "installed_packages", lambda: [])
     others.append(name())
     monkeypatch.undo()
     assert name() == name()
