@@ -144,9 +144,10 @@ def read_image(source: Path | bytes) -> NDArray[Any]:
     """Read a picture of one of `KINDS` as it is stored, upright: `to_rgb` converts it.
 
     Raises:
-        DataError: it is missing, damaged, too large or of another kind.
+        DataError: it is missing, damaged, too large or of another kind, or holds several pictures.
     """
     with opened_picture(source) as opened:
+        _check_single(source, opened)
         return _stored(opened)
 
 
@@ -194,6 +195,17 @@ def opened_picture(source: Path | bytes, kinds: tuple[str, ...] = KINDS) -> Gene
         raise DataError(f"{what} is not a picture in {', '.join(kinds)}") from None
     except _DAMAGED as error:
         raise DataError(f"{what} cannot be read ({error or type(error).__name__})") from error
+
+
+def _check_single(source: Path | bytes, opened: Image.Image) -> None:
+    """Refuse a file of several pictures, of which the first would be taken.
+
+    In a JPEG, others are previews and maps of a phone's camera.
+    """
+    what = source if isinstance(source, Path) else "an image"
+    count = 1 if opened.format in ("JPEG", "MPO") else getattr(opened, "n_frames", 1)
+    if count > 1:
+        raise DataError(f"{what} holds {count} pictures: write each into a file of its own")
 
 
 def check_pixels(what: object, height: int, width: int) -> None:

@@ -20,7 +20,7 @@ from acwm_core.data.shards import UNREADABLE
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, parse_json
-from acwm_formats.tables import parquet_file
+from acwm_formats.tables import parquet_file, read_parquet
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -137,13 +137,10 @@ def read_columns(path: Path, names: list[str], episode: int) -> Any:
         DataError: the file is missing or damaged, or has no such column.
     """
     order = ["episode_index", "frame_index"]
-    filters = [("episode_index", "==", episode)]
     check_fetched(path)
     try:
-        parquet_file(path).close()
-        table = parquet.read_table(
-            path, columns=list(dict.fromkeys([*order, *names])), filters=filters
-        )
+        columns = list(dict.fromkeys([*order, *names]))
+        table = read_parquet(path, columns, ("episode_index", episode))
         return table.sort_by([(name, "ascending") for name in order]).select(names)
     except (OSError, LookupError, ValueError, arrow.ArrowException) as error:
         raise _unreadable(path, error) from error
@@ -162,9 +159,9 @@ def _rows(root: Path) -> list[dict[str, Any]]:
     for path in paths:
         check_fetched(path)
         try:
-            file = parquet_file(path)
-            plain = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-            rows += file.read(columns=plain).to_pylist()
+            with parquet_file(path) as file:
+                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+            rows += read_parquet(path, names).to_pylist()
         except (OSError, ValueError, arrow.ArrowException) as error:
             raise _unreadable(path, error) from error
     return rows

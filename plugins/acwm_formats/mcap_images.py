@@ -13,6 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from acwm_core.data.video import LIMITS
 from acwm_core.errors import DataError
 from acwm_formats.frames import HDR
 from acwm_formats.images import to_rgb
@@ -119,7 +120,7 @@ class LoggedVideo(_Logged):
     def _all(self) -> Iterator[NDArray[np.uint8]]:
         decoder: Any = av.CodecContext.create(self._codec, "r")
         decoder.thread_count = 1
-        decoder.options = {"err_detect": "explode"}
+        decoder.options = {"err_detect": "explode", **LIMITS}
         try:
             for place, frame in enumerate(self._decoded(decoder)):
                 if frame.pts != place:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
+import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,13 +13,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.decoder import DecoderFactory
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.stream_reader import MAGIC_SIZE
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 from mcap_ros2.decoder import DecoderFactory as Ros2
 from numpy.typing import NDArray
+from zstandard import frame_content_size
 
+from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, parse_json
+from acwm_formats.frames import file_stamp
+
+_RECORD = struct.Struct("<BQ")
+"""The kind of a record, and its length."""
+
+_CHUNK = struct.Struct("<QQQII")
+"""How a chunk begins: its times, the bytes that it unpacks to, a checksum, and the length of the
+compression's name, which follows."""
+
+ZSTD = b"\x28\xb5\x2f\xfd"
 
 UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
 """Fields of messages that hold no action."""
@@ -112,11 +128,38 @@ def _decoding(path: Path, channel: Any, decoder: Any, data: bytes) -> Callable[[
     return content
 
 
+def check_chunks(path: Path) -> None:
+    """Refuse a log of which a chunk unpacks to far more than it stores.
+
+    Raises:
+        ValueError: there is one.
+    """
+    size, place = path.stat().st_size, MAGIC_SIZE
+    with path.open("rb") as file:
+        file.seek(place)
+        while place < size and len(head := file.read(_RECORD.size)) == _RECORD.size:
+            kind, length = _RECORD.unpack(head)
+            if kind == Opcode.CHUNK:
+                start = file.read(min(length, 128))
+                *_, unpacked, _, named = _CHUNK.unpack_from(start)
+                data = start[_CHUNK.size + named + 8 :]
+                known = frame_content_size(data) if data.startswith(ZSTD) else 0
+                check_unpacked(length, max(unpacked, known))
+            place += _RECORD.size + length
+            file.seek(place)
+
+
+@functools.lru_cache(maxsize=256)
+def _checked(path: Path, _: str) -> None:
+    check_chunks(path)
+
+
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[Any]:
     """A reader of the file; what it finds wrong in the block becomes a `DataError`."""
     check_fetched(path)
     try:
+        _checked(path, file_stamp(path))
         with path.open("rb") as file:
             yield make_reader(file)
     except DataError:

@@ -32,7 +32,7 @@ from acwm_formats.hdf5_store import HDF5Group, shared_file
 from acwm_formats.images import CHANNELS
 from acwm_formats.names import exact, natural, pair, text_note, typed, word
 from acwm_formats.sources import damage_of, files_in, guarded
-from acwm_formats.tables import MOST_COLUMNS
+from acwm_formats.tables import MOST_COLUMNS, read_parquet
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 METADATA = "metadata.json"
@@ -286,11 +286,16 @@ def _from_arrow(
     data: Path, stored: _Stored, index: int, _: Path | None
 ) -> tuple[_Seen, NDArray[Any]]:
     """Observations and actions of an episode, which is a folder of files; the last row has none."""
+    arrow: Any = importlib.import_module("pyarrow")
     dataset: Any = importlib.import_module("pyarrow.dataset")
-    files = [str(path) for path in files_in(data / stored.episodes[index], [f".{stored.kind}"])]
+    files = files_in(data / stored.episodes[index], [f".{stored.kind}"])
     for path in files:
-        check_fetched(Path(path))
-    table = dataset.dataset(files, format=stored.kind).to_table(["observations", "actions"])
+        check_fetched(path)
+    names = ["observations", "actions"]
+    if stored.kind == "parquet":
+        table = arrow.concat_tables([read_parquet(path, names) for path in files])
+    else:
+        table = dataset.dataset([*map(str, files)], format=stored.kind).to_table(names)
     column = table.column("observations").combine_chunks()
     is_dict, seen = isinstance(stored.observations, gymnasium.spaces.Dict), _Seen()
     for name, space in _parts(stored.observations).items():

@@ -271,8 +271,61 @@ def _check_head(head: bytes) -> None:
 
 
 def _parquet(path: Path) -> dict[str, Any]:
+    return _columns(read_parquet(path))
+
+
+def read_parquet(
+    path: Path, columns: Sequence[str] | None = None, episode: tuple[str, int] | None = None
+) -> Any:
+    """A Parquet file as a table of Arrow.
+
+    Args:
+        path: the file.
+        columns: those to read; all by default.
+        episode: a column and its value in the rows to read; all by default.
+
+    Raises:
+        ValueError: they would unpack to far more than is stored; or it is no such file.
+        OSError: it cannot be read.
+    """
+    size, unpacked = path.stat().st_size, 0
     with parquet_file(path) as file:
-        return _columns(file.read())
+        about, names = file.metadata, [*columns] if columns else None
+        groups = range(about.num_row_groups)
+        if episode is not None:
+            groups = [place for place in groups if _may_hold(about.row_group(place), *episode)]
+        read: list[Any] = []
+        for batch in file.iter_batches(_rows_at_once(file.schema, names), groups, names):
+            unpacked += batch.nbytes  # a value may be stored once for all rows
+            check_unpacked(size, unpacked)
+            read.append(batch)
+        schema = file.schema_arrow
+        if names is not None:
+            schema = arrow.schema([schema.field(name) for name in names])
+    table = arrow.Table.from_batches(read, schema=read[0].schema if read else schema)
+    if episode is None:
+        return table
+    compute: Any = importlib.import_module("pyarrow.compute")
+    return table.filter(compute.equal(table.column(episode[0]), episode[1]))
+
+
+def _rows_at_once(schema: Any, names: Sequence[str] | None) -> int:
+    """Few rows of columns with values of any size, such as texts and pictures."""
+    columns = [schema.column(place) for place in range(len(schema))]
+    read = [
+        c for c in columns if names is None or c.path.partition(".")[0] in names or c.path in names
+    ]
+    return 16 if any(column.physical_type == "BYTE_ARRAY" for column in read) else 2**16
+
+
+def _may_hold(group: Any, name: str, value: int) -> bool:
+    """Whether the statistics of a row group allow a value."""
+    for place in range(group.num_columns):
+        column = group.column(place)
+        known = column.statistics if column.path_in_schema == name else None
+        if known is not None and known.has_min_max:
+            return known.min <= value <= known.max
+    return True
 
 
 def parquet_file(path: Path) -> Any:

@@ -139,7 +139,7 @@ class ZarrReplay(Format):
                 "frames": buffer.ends[-1],
             },
             options=options | {"pixel_range": typed(pixel_range), "follow_links": follow_links},
-            notes=_notes(recordings, [name for name in found if name not in used]),
+            notes=_notes(recordings, [n for n in (*found, *buffer.names("SUTO")) if n not in used]),
             summary=f"The replay buffer {name}",
         )
 
@@ -185,10 +185,15 @@ class Buffer(ArrayStore):
     def __reduce__(self) -> Any:
         return Buffer, (self.path,)
 
-    def names(self) -> list[str]:
-        """The names of the arrays in ``data``."""
+    def names(self, kinds: str = "fiub") -> list[str]:
+        """The names of the arrays in ``data``, but of texts and hidden ones.
+
+        Args:
+            kinds: which, by NumPy's kinds of dtypes.
+        """
         with damage_of(self.path / "data"), _pointers_named(self.path / "data"):
-            return sorted(name for name, _ in self._group["data"].arrays())
+            arrays = self._group["data"].arrays()
+            return sorted(n for n, a in arrays if a.dtype.kind in kinds and not n.startswith("."))
 
     def array(self, name: str) -> Any:
         """An array of numbers whose codecs run no code.

@@ -6,6 +6,7 @@ import os
 import struct
 import zipfile
 
+import numpy as np
 import pyarrow
 import pyarrow.parquet
 
@@ -52,6 +53,16 @@ def parquet():
     return file.getvalue()
 
 
+def repeated():
+    """A Parquet file of one long text for all of its rows."""
+    rows = pyarrow.array(np.zeros(10**4, np.int32))
+    text = pyarrow.DictionaryArray.from_arrays(rows, pyarrow.array(["x" * 10**5]))
+    file = io.BytesIO()
+    table = pyarrow.table({"x": pyarrow.array([0.0] * 10**4), "note": text})
+    pyarrow.parquet.write_table(table, file)
+    return file.getvalue()
+
+
 def wide(columns):
     """A CSV of many columns."""
     names = ",".join(f"x{i}" for i in range(columns))
@@ -71,6 +82,7 @@ TABLES = {
     "j.json of a long number": b'{"x": [1' + b"0" * 4000 + b"]}",
     "k.json of many columns": json.dumps({f"x{i}": [1] for i in range(10**5)}).encode(),
     "l.parquet of equal rows": parquet,
+    "l.parquet of one long text": repeated,
     "m.npy of structures": npy((1,), bytes(8)).replace(b"'<f8'", b"[('a', '<f8')]"),
     "n.csv of one long field": b"x,y\n1," + b"9" * 10**6 + b"\n",
     "o.npy of three axes": npy((2, 2, 2), bytes(64)),

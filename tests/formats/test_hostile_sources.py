@@ -12,6 +12,7 @@ import pyarrow.dataset
 import pytest
 import zarr
 from click.testing import CliRunner
+from mcap.writer import CompressionType, Writer
 from minari.dataset.minari_storage import MinariStorage
 
 from acwm_core.cli import main
@@ -349,6 +350,23 @@ def test_times_that_are_far_off(tmp_path, first):
         row[0] = first if not place else str(1.8e9 + place / 10)
     table.write_text("\n".join([lines[0], *map(",".join, rows)]))
     assert "take_9" in refused(run("videos", path, tmp_path / "data", options))
+
+
+@pytest.mark.parametrize("lies", [False, True])
+def test_chunks_of_a_log_that_unpack_to_gigabytes(tmp_path, lies):
+    path, spoilt, options = source(tmp_path, "mcap")
+    with spoilt.open("wb") as file:
+        writer = Writer(file, chunk_size=2**30, compression=CompressionType.ZSTD)
+        writer.start()
+        channel = writer.register_channel("/zeros", "json", 0)
+        for _ in range(5):
+            writer.add_message(channel, 0, bytes(2**26), 0)
+        writer.finish()
+    if lies:  # the header of the chunk, not that of what is in it
+        data = spoilt.read_bytes()
+        place = data.index(b"\x06", 60) + 9 + 16
+        spoilt.write_bytes(data[:place] + bytes(8) + data[place + 8 :])
+    assert "claim to hold 335," in refused(run("mcap", path, tmp_path / "data", options))
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", "meta/episodes.jsonl", "meta/acwm.json"])

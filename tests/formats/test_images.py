@@ -129,6 +129,16 @@ def test_the_bytes_tell_the_kind(tmp_path):
         assert number_in(to_rgb(read_image(path))) == NUMBER
 
 
+@pytest.mark.parametrize("kind", ["TIFF", "WEBP", "PNG"])
+def test_a_file_of_several_pictures_is_refused(kind):
+    """Of which the first would be taken, in silence."""
+    first, other = (Image.new("RGB", (8, 8), colour) for colour in ("red", "blue"))
+    buffer = io.BytesIO()
+    first.save(buffer, kind, save_all=True, append_images=[other])
+    with pytest.raises(DataError, match="holds 2 pictures"):
+        read_image(buffer.getvalue())
+
+
 def claiming(kind, width, height):
     """A small picture whose header claims another size."""
     data = bytearray(stored(kind, Image.new("L", (8, 8))))

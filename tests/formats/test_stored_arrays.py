@@ -74,6 +74,16 @@ def test_codecs_that_run_code_are_refused(tmp_path, codec):
         ZarrReplay().read(path, **options)
 
 
+def test_texts_are_named_and_hidden_arrays_are_not_read(tmp_path):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    group = zarr.open_group(str(path), mode="a", zarr_format=2)
+    group.create_array("data/task", data=np.array(["push"] * 27))
+    (path / "data/state").rename(path / "data/.state")  # whose links nobody looked at
+    recorded = ZarrReplay().read(path, **options)
+    assert recorded.notes == ("Arrays that were left out: task.",)
+    assert recorded.splits[0].states == {}
+
+
 def test_a_buffer_in_one_file(tmp_path):
     path, options = arrays.replay(tmp_path, PLAIN)
     with zipfile.ZipFile(tmp_path / "packed.zarr.zip", "w") as archive:
