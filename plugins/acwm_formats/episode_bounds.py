@@ -14,10 +14,12 @@ from acwm_core.errors import DataError
 Bounds = list[tuple[int, int]]
 """The first row of each episode and the row after its last."""
 
-_WHOSE = ("ep", "eps", "episode", "episodes", "traj", "trajs", "trajectory", "demo", "rollout")
+_WHOSE = (
+    *("ep", "eps", "episode", "episodes", "traj", "trajs", "trajectory", "demo", "rollout"),
+    *("trial", "take"),
+)
 
-
-_ALSO = ("seq", "sequence", "path", "run", "clip", "game")
+_ALSO = ("seq", "sequence", "path", "run", "clip", "game", "segment", "session", "recording")
 
 
 def _names(*parts: str) -> frozenset[str]:

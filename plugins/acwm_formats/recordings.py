@@ -20,7 +20,7 @@ from acwm_core.env.card import plain_rate
 from acwm_core.env.episode import SPLITS, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import LocalExecutor, progress_bar
-from acwm_core.files import held, writing, written_whole
+from acwm_core.files import held, plain_name, writing, written_whole
 from acwm_formats.action_rates import Parts, action_rate
 from acwm_formats.alignment import Defect
 from acwm_formats.cadence import QUARTER, SAME, common_rate
@@ -71,10 +71,14 @@ def import_dataset(
 
     Raises:
         DataError: recordings have defects and `options` do not say what to do about them; the
-            folder holds another dataset or is in use.
+            folder holds another dataset or is in use; the name of the environment is no plain word.
         ShapeError: the frame size is not possible.
     """
     options = options or ImportOptions()
+    try:
+        plain_name(options.environment or recorded.name, "an environment")
+    except ValueError as error:
+        raise DataError(str(error)) from None
     parts = divided(recorded, options.test_episodes)
     if not parts:
         raise DataError(f"{recorded.facts['name']} holds no recordings")
@@ -283,7 +287,8 @@ class _Import:
             wrong = sum(1 for known in defects.values() if known)
             choice = "; --on-defect skip imports the others" if kept else ""
             listed = ";\n".join(f"  {line}" for line in few(messages))
-            raise DataError(f"{wrong} of {count} recordings have defects{choice}:\n{listed}")
+            have = "has" if wrong == 1 else "have"
+            raise DataError(f"{wrong} of {count} recordings {have} defects{choice}:\n{listed}")
         skipped = [str(d) for key, known in defects.items() if key not in kept for d in known]
         return [*kept.values()], skipped
 

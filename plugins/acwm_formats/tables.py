@@ -41,6 +41,11 @@ MOST_COLUMNS = 4096
 
 DELIMITERS = (b",", b";", b"\t")
 
+_DECIMAL_COMMA, _DECIMAL_POINT = (
+    re.compile(rb"(?m)(^|;)-?\d*" + c + rb"\d") for c in (b",", b"\\.")
+)
+"""Numbers between semicolons, as Excel writes them in some countries, and in others."""
+
 ENCODINGS = {
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",
@@ -214,12 +219,17 @@ def _csv(path: Path) -> dict[str, Any]:
     head = re.split(rb"[\r\n]", data, maxsplit=1)[0]
     _check_width(head.count(delimiter) + 1)
     _check_head(head)
+    commas = delimiter == b";" and _DECIMAL_COMMA.search(data) and not _DECIMAL_POINT.search(data)
     table = csv.read_csv(
         arrow.BufferReader(data),
         parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
-        convert_options=csv.ConvertOptions(strings_can_be_null=True),
+        convert_options=csv.ConvertOptions(
+            strings_can_be_null=True, decimal_point="," if commas else "."
+        ),
     )
-    return _columns(table)
+    columns = _columns(table)
+    _check_names(columns)
+    return columns
 
 
 def _utf8(data: bytes) -> bytes:
@@ -268,6 +278,16 @@ def _check_head(head: bytes) -> None:
         raise ValueError(
             f"its first line holds numbers ({shown}): write the names of the columns above it"
         )
+
+
+def _check_names(columns: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse names of which some are numbers, and the others stand above text: a row of data."""
+    numbers = [name for name in columns if name and _is_number(name)]
+    words = [name for name in columns if name and name not in numbers]
+    above_text = not any(holds_numbers(columns[name]) for name in words)
+    if numbers and words and above_text and all(holds_numbers(columns[n]) for n in numbers):
+        shown = ", ".join([*columns][:4])
+        raise ValueError(f"its first line is a row ({shown}): write the names of the columns above")
 
 
 def _parquet(path: Path) -> dict[str, Any]:

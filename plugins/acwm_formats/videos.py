@@ -311,6 +311,8 @@ class _Tables:
         same = [path for path in same if composed(path.stem) == composed(stem)] or same
         if len({path.stem for path in same}) > 1:
             names = " and ".join(path.name for path in same)
+            if len({composed(path.name) for path in same}) == 1:
+                names += ", which differ in how their accents are stored,"
             raise DataError(f"{names} could both be the table of {stem}: rename one")
         endings = [*READERS]
         return sorted(same, key=lambda path: endings.index(path.suffix.lower()))

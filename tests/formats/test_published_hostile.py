@@ -77,7 +77,7 @@ def test_videos_that_cannot_be_are_refused(folder, tmp_path):
     playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\n{folder}/ind_test/episode_0.mp4\n"
     for content in (whole[: len(whole) // 2], b"", b"text", playlist.encode()):
         path.write_bytes(content)
-        with pytest.raises(DataError, match=r"1 of 9 recordings have defects.*\n.*episode_3\.mp4"):
+        with pytest.raises(DataError, match=r"1 of 9 recordings has defects.*\n.*episode_3\.mp4"):
             load(folder, tmp_path / "data")
     path.unlink()
     with pytest.raises(DataError, match=r"episode_3\.mp4 cannot be read \(No such file"):

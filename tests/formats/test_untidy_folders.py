@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from acwm_core.errors import DataError
+from acwm_formats.reading import ImportOptions
+from acwm_formats.recordings import import_dataset
 from acwm_formats.tables import read_table
 from acwm_formats.videos import Videos
 from tests.formats.corpus import files
@@ -85,6 +87,7 @@ TEXTS = {
     "comments and a header of numpy": "# by hand\n#time,x,y\n0,1,2\n0.1,3,4\n# the end\n",
     "a comment like a header": f"# one, two, three\n{PLAIN_TEXT}",
     "a separator for Excel": f"sep=;\n{PLAIN_TEXT.replace(',', ';')}",
+    "decimal commas": PLAIN_TEXT.replace(",", ";").replace(".", ","),
     "lines of old Macs": PLAIN_TEXT.replace("\n", "\r"),
     "semicolons after a comment": "# a, b, c, d\n" + PLAIN_TEXT.replace(",", ";"),
 }
@@ -96,6 +99,38 @@ def test_tables_as_programs_write_them(tmp_path, text):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     found = {name: column.tolist() for name, column in read_table(path).items()}
     assert found == {"time": [0, 0.1], "x": [1, 3], "y": [2, 4]}
+
+
+@pytest.mark.parametrize("text", ["0,1,push\n1,2,push\n2,0,pull\n", "push;3\npull;4\n"])
+def test_a_first_row_in_place_of_names_is_refused(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(DataError, match="its first line is a row"):
+        read_table(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("text", ["frame,0,1\n0,2,5\n1,3,6\n", "task,x,0\npush,2,5\n"])
+def test_numbers_may_be_names(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text)
+    assert [*read_table(tmp_path / "a.csv")] == text.splitlines()[0].split(",")
+
+
+@pytest.mark.parametrize("name", ["trial", "take_id", "Segment Index", "recording.number"])
+def test_a_column_that_numbers_several_recordings(tmp_path, name):
+    files.videos(tmp_path, PLAIN)
+    for path in tmp_path.glob("*.csv"):
+        first, *rows = path.read_text().splitlines()
+        numbered = [f"{row},{place // 4}" for place, row in enumerate(rows)]
+        path.write_text("\n".join([f"{first},{name}", *numbered]))
+    with pytest.raises(DataError, match=r"numbers [23] episodes, but .* is one"):
+        rows_of(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a\nb", ".."])
+def test_a_name_that_leads_elsewhere_is_refused_at_once(tmp_path, name):
+    files.videos(tmp_path, PLAIN)
+    with pytest.raises(DataError, match="cannot be the name of an environment"):
+        import_dataset(Videos().read(tmp_path), tmp_path / "out", ImportOptions(environment=name))
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_numpy_writes(tmp_path):
