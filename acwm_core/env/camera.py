@@ -80,13 +80,21 @@ class Camera:
         return np.stack([right, np.cross(forward, right), forward])
 
     @property
-    def _pinhole(self) -> bool:
-        return self.half_height is None
+    def is_flat(self) -> bool:
+        """Whether it is orthographic: what is far away is not smaller."""
+        return self.half_height is not None
 
     @property
-    def _height(self) -> float:
-        """The height that the frame of an orthographic camera shows."""
-        return 2 * (self.half_height or 0.0)
+    def scale(self) -> float:
+        """Frame coordinates per metre; of a pinhole at a depth of 1 m, and less in proportion."""
+        return self.focal() if self.half_height is None else 0.5 / self.half_height
+
+    @property
+    def half_extent(self) -> float:
+        """Half of the height that the frame shows, m; of a pinhole as far away as its target."""
+        if self.half_height is not None:
+            return self.half_height
+        return math.dist(self.eye, self.target) * math.tan(math.radians(self.fov) / 2)
 
     def focal(self, height: int = 1) -> float:
         """Focal length in pixels for a frame of this height; in frame heights for `height` 1.
@@ -105,14 +113,14 @@ class Camera:
         along = (given - constant(self.eye, given))[..., None, :] * constant(self.axes, given)
         local = along.sum(-1)
         seen, depth = local[..., :2], local[..., 2:]
-        seen = seen * self.focal() / depth if self._pinhole else seen / self._height
+        seen = seen * self.scale if self.is_flat else seen * self.scale / depth
         return namespace(given).concatenate([seen, depth], -1)
 
     def from_frame(self, seen: Array) -> Array:
         """Convert frame coordinates and depth [..., 3] to world points; inverse of `to_frame`."""
         given = real(seen)
         spots, depth = given[..., :2], given[..., 2:]
-        spots = spots * depth / self.focal() if self._pinhole else spots * self._height
+        spots = spots / self.scale if self.is_flat else spots * depth / self.scale
         local = namespace(given).concatenate([spots, depth], -1)
         in_world = (local[..., None, :] * constant(self.axes.T, given)).sum(-1)
         return in_world + constant(self.eye, given)

@@ -94,14 +94,14 @@ def rotations_of(symmetry: BodySymmetry) -> NDArray[np.float64]:
 def _cube() -> set[tuple[float, ...]]:
     """The 24 rotations of a cube; q and −q are the same rotation, and only one is included."""
     half = np.sqrt(0.5)
-    found = [tuple(row) for row in np.eye(4)]
+    rows = [tuple(row) for row in np.eye(4)]
     for pair in itertools.combinations(range(4), 2):
         for sign in (half, -half):
             row = np.zeros(4)
             row[pair[0]], row[pair[1]] = half, sign
-            found.append(tuple(row))
-    found += [(0.5, *signs) for signs in itertools.product((0.5, -0.5), repeat=3)]
-    return {tuple(float(x) for x in row) for row in found}
+            rows.append(tuple(row))
+    rows += [(0.5, *signs) for signs in itertools.product((0.5, -0.5), repeat=3)]
+    return {tuple(float(x) for x in row) for row in rows}
 
 
 def nearest_alike(quaternion: Array, symmetry: BodySymmetry, to: Array) -> Array:
@@ -125,6 +125,19 @@ def angle_of_code(code: Array, folds: int) -> Array:
     """The inverse of `angle_code`, in [-π / folds, π / folds]; the code may have any length."""
     values = real(code)
     return namespace(values).arctan2(values[..., 1], values[..., 0]) / folds
+
+
+def nearest_angle(angle: Array, folds: int, to: Array) -> Array:
+    """Of the angles that look like these `[…]`, in rad, those nearest to others `[…]`."""
+    values: Any = real(angle)
+    period = 2 * np.pi / folds
+    return values + period * ((real(to) - values) / period).round()
+
+
+def angle_difference(first: Array, second: Array, folds: int) -> Array:
+    """How far angles `[…]` are from others that may look alike, in [-π / folds, π / folds)."""
+    period = 2 * np.pi / folds
+    return (real(first) - real(second) + period / 2) % period - period / 2
 
 
 def rotation_code(quaternion: Array, symmetry: BodySymmetry) -> Array:
@@ -218,7 +231,7 @@ _AROUND = np.arange(8) * np.pi / 8
 
 def _of_fourth(code: Any) -> Any:
     """Rotation matrices of cubes, whose axes are the maxima of Σ (axis · v)⁴ on the sphere."""
-    still, linear = (constant(each, code) for each in _tensor_of_code())
+    still, linear = (constant(numbers, code) for numbers in _tensor_of_code())
     entries = still + (linear * code[..., None, :]).sum(-1)
     tensor = entries.reshape(*code.shape[:-1], 3, 3, 3, 3)
     tries = _unit(constant(_STARTS, code)) + 0 * code[..., None, :3]
@@ -250,7 +263,7 @@ def _columns(x: Any, y: Any) -> Any:
 
 def _cross(a: Any, b: Any) -> Any:
     order = [[1, 2, 0], [2, 0, 1]]
-    (a1, a2), (b1, b2) = ([each[..., k] for k in order] for each in (a, b))
+    (a1, a2), (b1, b2) = ([vectors[..., k] for k in order] for vectors in (a, b))
     return a1 * b2 - a2 * b1
 
 

@@ -22,6 +22,7 @@ from acwm_core.env.rotations import (
     angle_code,
     angle_of_code,
     nearest_alike,
+    nearest_angle,
     product,
     rotation_code,
     rotation_of_code,
@@ -99,8 +100,7 @@ def _decoded(field: StateField, part: Part, code: Any, near: Any) -> Any:
     if part.kind == "angle":
         folds = FOLDS[field.symmetry]
         angle: Any = angle_of_code(code.reshape(*code.shape[:-1], -1, 2), folds)
-        period = 2 * math.pi / folds
-        return angle if near is None else angle + period * ((near - angle) / period).round()
+        return angle if near is None else nearest_angle(angle, folds, near)
     return code
 
 

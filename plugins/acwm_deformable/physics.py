@@ -35,12 +35,12 @@ def _length(seen: Observation, start: States) -> Array:
     The area stays reliable where the rope touches itself, but tracing fails there.
     """
     masks, camera = seen.masks == ROPE_ID, ROPE_CAMERA
-    height, (_, down, forward) = masks.shape[1], camera.axes
+    height, forward = masks.shape[1], camera.axes[2]
     rows = (np.arange(height) + 0.5) / height - 0.5
-    rays = forward + rows[:, None] / camera.focal() * down
-    depth = (ROPE_RADIUS - camera.eye[2]) / rays[:, 2]
+    table = camera.on_plane(np.stack([np.zeros(height), rows], -1), ROPE_RADIUS)
+    depth = camera.to_frame(table)[:, 2]
     # Seen at an angle, a pixel covers more of the table than its width squared.
-    area = (depth / camera.focal() / height) ** 2 / np.abs(forward[2])
+    area = (depth / camera.focal(height)) ** 2 / np.abs(forward[2])
     return (masks.sum(2) * area).sum(1) / (2 * ROPE_RADIUS)
 
 

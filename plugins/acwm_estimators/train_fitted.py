@@ -13,6 +13,7 @@ import torch
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.physics import StateEstimator
+from acwm_core.env.rotations import angle_difference
 from acwm_core.evaluation.clips import as_clip
 from acwm_estimators.estimator import FittedEstimator
 from acwm_estimators.fitted import fitted_layout
@@ -103,9 +104,8 @@ def _compared(
         off = seen.states[points.field] - episode.states[points.field]
         errors[points.field] = np.linalg.norm(off, axis=-1).reshape(-1)
     for local in layout.locals:
-        turn = 2 * np.pi / local.fold
-        off = np.asarray(seen.states[local.field] - episode.states[local.field], float)
-        errors[local.field] = np.abs((off + turn / 2) % turn - turn / 2).reshape(-1)
+        angles = seen.states[local.field], episode.states[local.field]
+        errors[local.field] = np.abs(angle_difference(*angles, local.fold)).reshape(-1)
     instances = dataset.card.environment.instances
     for name in layout.instances:
         true, found = (masks == instances.index(name) for masks in (episode.masks, seen.masks))

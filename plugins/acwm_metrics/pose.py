@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.env.physics import Physics, Reading
-from acwm_core.env.rotations import FOLDS, product, rotations_of
+from acwm_core.env.rotations import FOLDS, angle_difference, product, rotations_of
 from acwm_core.env.state_field import SYMMETRIES, BodySymmetry
 from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means
@@ -122,9 +122,8 @@ def _turned(prediction: Prediction, reading: Reading) -> NDArray[np.float64]:
 def angle_between(
     first: NDArray[np.floating], second: NDArray[np.floating], symmetry: BodySymmetry
 ) -> NDArray[np.float64]:
-    """The smaller angle between two angles, in [0, period / 2] rad."""
-    period = 2 * np.pi / FOLDS[symmetry]
-    return np.abs((np.asarray(first, np.float64) - second + period / 2) % period - period / 2)
+    """The smaller angle between two angles of a body that has a symmetry, in rad."""
+    return np.abs(angle_difference(first, second, FOLDS[symmetry]))
 
 
 def turn_between(

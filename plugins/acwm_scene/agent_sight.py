@@ -28,7 +28,7 @@ BELOW = -30.0
 """Logit of a distance at which an agent would be below the ground."""
 
 
-class Found(NamedTuple):
+class AgentPlaces(NamedTuple):
     """Where agents seem to be in a latent frame.
 
     Attributes:
@@ -88,10 +88,10 @@ class AgentSight(nn.Module):
         )
         self.pair = None
         if layout.agents > 1:
-            told = waves_size(2, OCTAVES)
-            self.pair = nn.Sequential(nn.Linear(told, PAIR), nn.SiLU(), nn.Linear(PAIR, 1))
+            features = waves_size(2, OCTAVES)
+            self.pair = nn.Sequential(nn.Linear(features, PAIR), nn.SiLU(), nn.Linear(PAIR, 1))
 
-    def forward(self, frame: Tensor) -> Found:
+    def forward(self, frame: Tensor) -> AgentPlaces:
         """Where agents are in a latent frame `[B, C, h, w]`."""
         near, aspect = self.near(frame), frame.shape[3] / frame.shape[2]
         cells = self.spot(near).flatten(2).float()
@@ -100,17 +100,17 @@ class AgentSight(nn.Module):
         shift = self.shift(seen).float()
         spots = spots + ASIDE * shift[..., :2]
         if self.axes == 2:
-            return Found(self.view.on_ground(spots, aspect), cells, cells[..., :0])
+            return AgentPlaces(self.view.on_ground(spots, aspect), cells, cells[..., :0])
         distances = self._distances(near, seen, spots.detach())
         far = (distances.softmax(-1) @ self.tried)[..., None] + APART * shift[..., 2:]
         places = self.view.places(torch.cat([spots, self.view.eye.norm() + far], -1), aspect)
-        return Found(places, cells, distances)
+        return AgentPlaces(places, cells, distances)
 
-    def loss(self, found: Found, true: Tensor, size: torch.Size) -> Tensor:
+    def loss(self, located: AgentPlaces, true: Tensor, size: torch.Size) -> Tensor:
         """Cross entropy of the cells and distances of agents `[B, A, D]`, a scalar.
 
         Args:
-            found: by `forward`.
+            located: by `forward`.
             true: places of the agents.
             size: rows and columns of cells.
         """
@@ -118,11 +118,11 @@ class AgentSight(nn.Module):
         inside = (seen[..., :2].abs() <= 1).all(-1)
         away = cell_places(size, true.device) - seen[:, :, None, :2]
         cells_away = (away * away.new_tensor([size[1] / 2, size[0] / 2])).norm(dim=-1)
-        loss = (_missed(found.cells, cells_away) * inside).mean()
+        loss = (_missed(located.cells, cells_away) * inside).mean()
         if self.axes == 2:
             return loss
         far = seen[..., 2:] - self.view.eye.norm() - self.tried
-        return loss + _missed(found.distances, far / (self.tried[1] - self.tried[0])).mean()
+        return loss + _missed(located.distances, far / (self.tried[1] - self.tried[0])).mean()
 
     def _distances(self, near: Tensor, seen: Tensor, spots: Tensor) -> Tensor:
         """How well each distance fits what the ground shows, `[B, A, K]`.
@@ -134,7 +134,7 @@ class AgentSight(nn.Module):
         """
         aspect, count = near.shape[3] / near.shape[2], len(self.tried)
         tried = (self.view.eye.norm() + self.tried)[:, None].expand(*spots.shape[:2], -1, 1)
-        spots, seen = (each[:, :, None].expand(-1, -1, count, -1) for each in (spots, seen))
+        spots, seen = (tensor[:, :, None].expand(-1, -1, count, -1) for tensor in (spots, seen))
         places = self.view.places(torch.cat([spots, tried], -1), aspect)
         below = self.ground((near + self.wide(near)).float(), places.flatten(1, 2))
         fits = self.match(torch.cat([below.unflatten(1, places.shape[1:3]), seen], -1))
@@ -154,9 +154,9 @@ class AgentSight(nn.Module):
         apart = places[:, :, None, :, None] - places[:, None, :, None]
         relative = torch.stack([apart[..., 2], apart[..., :2].norm(dim=-1)], -1)
         agreed = pair(waves(relative, OCTAVES)).float()[..., 0]
-        heard = (agreed + fits[:, None, :, None]).logsumexp(-1)
+        messages = (agreed + fits[:, None, :, None]).logsumexp(-1)
         others = 1 - torch.eye(fits.shape[1], device=fits.device)
-        return (heard * others[..., None]).sum(2)
+        return (messages * others[..., None]).sum(2)
 
 
 def cell_places(size: torch.Size, device: torch.device) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
+from acwm_core.env.rotations import angle_code, angle_of_code
 from acwm_core.model.batch import to_device
 from acwm_core.model.dynamics import Keypoints
 from acwm_scene.agent_sight import cell_places
@@ -19,7 +20,7 @@ from acwm_scene.body_windows import moving_windows
 from acwm_scene.declared import GroupSpec, unit_of
 from acwm_scene.group import SteppedGroup, at_frame, declared_keypoints, energy_score, stacked
 from acwm_scene.nodes import View
-from acwm_scene.poses import Poses, angle_between, direction, turned_back
+from acwm_scene.poses import Poses, turned_back
 
 FOLLOWED = 32
 """Clips of a step of `motion_loss` in which agents are followed; they learn fast."""
@@ -83,7 +84,7 @@ class BodyGroup(SteppedGroup):
             agents.reshape(batch, frames, spec.agents, 2) / self.unit,
             present[:, :1, :, None].expand(-1, frames, -1, -1),
             places.reshape(batch, frames, spec.bodies, spec.axes)[..., :2] / self.unit,
-            direction(spec.folds * angles),
+            angle_code(angles, spec.folds),
         )
 
     def decode(self, course: Poses) -> Tensor:
@@ -94,8 +95,7 @@ class BodyGroup(SteppedGroup):
         places = self.unit * course.places
         if self.spec.axes == 3:
             places = functional.pad(places, (0, 1), value=math.nan)
-        cosine, sine = course.turns.unbind(-1)
-        angles = torch.atan2(sine, cosine) / self.spec.folds
+        angles = angle_of_code(course.turns, self.spec.folds)
         agents = (self.unit * course.agents).flatten(2)
         present = [course.present[..., 0]] if self.spec.has_presence else []
         return torch.cat([agents, *present, places.flatten(2), angles], 2)
@@ -105,7 +105,7 @@ class BodyGroup(SteppedGroup):
         cells = self._cells(given.shape[-2:])
         now, _ = self.sight(given[:, -1], cells)
         before = self.sight(given[:, -2], cells)[0] if given.shape[1] > 1 else now
-        return self._begun(now, *(each / self.stride for each in self._changes(before, now)))
+        return self._begun(now, *(change / self.stride for change in self._changes(before, now)))
 
     def begin(self, frame: Poses, previous: Poses) -> Moving:
         """Things that move on as they did; see `Group.begin`."""
@@ -234,13 +234,13 @@ class BodyGroup(SteppedGroup):
 
     def _changes(self, before: Poses, now: Poses) -> tuple[Tensor, Tensor, Tensor]:
         """Changes of the agents' and of the bodies' places, and of the bodies' angles."""
-        spin = angle_between(before.turns, now.turns) / self.spec.folds
+        spin = angle_of_code(turned_back(now.turns, before.turns), self.spec.folds)[..., None]
         return now.agents - before.agents, now.places - before.places, spin
 
     def _earlier(self, state: Moving, frames: int) -> Poses:
         """The poses so many video frames before, if things moved as they do now."""
         poses = state.poses
-        back = direction(self.spec.folds * frames * state.spin[..., 0])
+        back = angle_code(frames * state.spin[..., 0], self.spec.folds)
         return Poses(
             poses.agents - frames * state.agent_change,
             poses.present,

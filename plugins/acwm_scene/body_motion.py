@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_scene.poses import Poses, direction, turned, turned_back, waves, waves_size
+from acwm_core.env.rotations import angle_code, angle_of_code
+from acwm_scene.poses import Poses, turned, turned_back, waves, waves_size
 
 HIDDEN = 64
 """Size of the hidden state by which an agent follows its actions."""
@@ -122,8 +123,7 @@ class BodyMotion(nn.Module):
         """Move the bodies by one frame, while the agents move to `agents`, `[B, A, 2]`."""
         poses, change, spin = moving.poses, moving.place_change, moving.spin
         silu, places = functional.silu, poses.places
-        sine, cosine = poses.turns[..., 1], poses.turns[..., 0]
-        frame = direction(torch.atan2(sine, cosine) / self.folds)
+        frame = angle_code(angle_of_code(poses.turns, self.folds), 1)
         own = self.own(
             torch.cat(
                 [
@@ -152,10 +152,10 @@ class BodyMotion(nn.Module):
             self.chain(pairs) + self.of_own(moved)[:, :, None] + self.of_other(moved)[:, None]
         )
         pulls = (silu(self.chained(pairs)) * mask).sum(2)
-        made = self.out(silu(self.last(torch.cat([moved, pulls], -1))))
-        made = made.clamp(-FASTEST, FASTEST) * poses.present
-        change, spin = turned(made[..., :2], frame), made[..., 2:]
-        turns = turned(poses.turns, direction(self.folds * spin[..., 0]))
+        changes = self.out(silu(self.last(torch.cat([moved, pulls], -1))))
+        changes = changes.clamp(-FASTEST, FASTEST) * poses.present
+        change, spin = turned(changes[..., :2], frame), changes[..., 2:]
+        turns = turned(poses.turns, angle_code(spin[..., 0], self.folds))
         return moving._replace(
             poses=Poses(agents, poses.present, places + change, turns),
             agent_change=agents - poses.agents,
@@ -167,8 +167,8 @@ class BodyMotion(nn.Module):
         """What the agents do to each body, `[B, N, channels]`."""
         seen = frame[:, :, None]
         before, after = (
-            turned_back(each[:, None] - poses.places[:, :, None], seen)
-            for each in (poses.agents, agents)
+            turned_back(places[:, None] - poses.places[:, :, None], seen)
+            for places in (poses.agents, agents)
         )
         moves = torch.cat([waves(before, NEAR), waves(after, NEAR), (after - before) / STEP], -1)
         pushed = functional.silu(self.push(moves) + own[:, :, None])

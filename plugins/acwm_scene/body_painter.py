@@ -73,10 +73,12 @@ class BodyPainter(Painter):
             size: rows and columns of cells.
         """
         agents, places, turns = (
-            each.unbind(1) for each in (poses.agents, poses.places, poses.turns)
+            values.unbind(1) for values in (poses.agents, poses.places, poses.turns)
         )
         seen = torch.ones_like(agents[0][..., :1])
-        earlier = [torch.cat(_changes(each), -1) for each in (agents, places, turns) if each[1:]]
+        earlier = [
+            torch.cat(_changes(frames), -1) for frames in (agents, places, turns) if frames[1:]
+        ]
         of_agents = earlier[:1] or [agents[0][..., :0]]
         present = poses.present[:, 0]
         maps = [

@@ -40,9 +40,9 @@ class BodySight(Look):
         grid = self.features(frame)
         looks = self.where(grid).flatten(2).float().softmax(-1)
         seen = self.what(grid).unflatten(1, (self.things, 4)).flatten(3).float()
-        found = (seen * looks[:, :, None]).sum(-1)
-        places = looks @ cells + found[..., :2]
-        turns = functional.normalize(found[:, self.agents :, 2:], dim=-1)
+        located = (seen * looks[:, :, None]).sum(-1)
+        places = looks @ cells + located[..., :2]
+        turns = functional.normalize(located[:, self.agents :, 2:], dim=-1)
         logits = self.there(grid.flatten(2).amax(-1)).float()
         present = logits.sigmoid()[..., None]
         present = present + (present.round() - present).detach()  # 0 or 1, with a gradient
@@ -56,14 +56,14 @@ def sight_loss(seen: Poses, logits: Tensor, true: Poses) -> Tensor:
     return agents + pose_loss(seen, true) + presence
 
 
-def pose_loss(made: Poses, true: Poses) -> Tensor:
+def pose_loss(predicted: Poses, true: Poses) -> Tensor:
     """The error of the poses of the bodies that are there, a scalar.
 
     Places count by their distance and not its square: the few that are far off, because a push was
     missed or something is hidden, would outweigh all others.
     """
-    places = functional.smooth_l1_loss(made.places, true.places, beta=0.05, reduction="none")
-    turns = functional.smooth_l1_loss(made.turns, true.turns, beta=0.1, reduction="none")
+    places = functional.smooth_l1_loss(predicted.places, true.places, beta=0.05, reduction="none")
+    turns = functional.smooth_l1_loss(predicted.turns, true.turns, beta=0.1, reduction="none")
     return ((places + 0.2 * turns) * true.present).sum() / true.present.sum().clamp(min=1)
 
 

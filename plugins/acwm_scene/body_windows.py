@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from acwm_scene.poses import Poses, angle_between
+from acwm_core.env.rotations import angle_of_code
+from acwm_scene.poses import Poses, turned_back
 
 HORIZONS = ((0.35, 4), (0.65, 8), (1.0, 16))
 """Until which share of the training windows have so many frames. Longer ones taught it worse: after
@@ -52,7 +53,7 @@ def moving_windows(
         return values[rows[:, None], numbers].take_along_dim(kept[:, None], 2)
 
     places, turns = of_bodies(true.places), of_bodies(true.turns)
-    spin = angle_between(turns[:, 0], turns[:, 1]) / folds
+    spin = angle_of_code(turned_back(turns[:, 1], turns[:, 0]), folds)[..., None]
     window = Poses(
         true.agents[rows[:, None], numbers][:, 1:],
         present.take_along_dim(kept, 1)[:, None].expand(-1, horizon + 1, -1, -1),
@@ -67,12 +68,12 @@ def _chosen(
 ) -> tuple[Tensor, Tensor]:
     """Clips and first frames of windows."""
     clips, frames = true.places.shape[:2]
-    drawn = 4 * wanted
-    rows = torch.randint(clips, (drawn,), generator=random)
-    starts = torch.randint(frames - horizon, (drawn,), generator=random)
+    tries = 4 * wanted
+    rows = torch.randint(clips, (tries,), generator=random)
+    starts = torch.randint(frames - horizon, (tries,), generator=random)
     moves = (true.places.diff(dim=1).abs().sum(-1) > MOVES).any(-1).cpu()
     inside = starts[:, None] + torch.arange(horizon)
-    kept = moves[rows[:, None], inside].any(1) | (torch.rand(drawn, generator=random) < STILL)
+    kept = moves[rows[:, None], inside].any(1) | (torch.rand(tries, generator=random) < STILL)
     chosen = kept.nonzero()[:wanted, 0]
     if not len(chosen):
         chosen = torch.arange(wanted)

@@ -29,10 +29,7 @@ unit large, and nodes are a fraction of one apart."""
 
 def unit_of(camera: Camera, kind: Kind) -> float:
     """Metres that count as one in a group of this kind, by what the camera sees."""
-    half = camera.half_height
-    if half is None:
-        half = math.dist(camera.eye, camera.target) * math.tan(math.radians(camera.fov) / 2)
-    return half / UNITS[kind]
+    return camera.half_extent / UNITS[kind]
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ def groups_of(card: EnvironmentCard | None, states: Sequence[str]) -> dict[str, 
     chosen, columns = [card.fields[name] for name in states], _Columns(starts)
     spec = _nodes(chosen, columns, card) or _bodies(chosen, columns, card)
     specs = {spec.kind: spec} if spec else {}
-    rest = [each for each in chosen if not spec or each.name not in columns.taken]
+    rest = [field for field in chosen if not spec or field.name not in columns.taken]
     if rest:
         specs["values"] = _values(rest, columns)
     return {"specs": specs, "state_size": size}
@@ -113,14 +110,14 @@ def default_states(card: EnvironmentCard, changing: Collection[str]) -> tuple[st
         card: of the environment.
         changing: names of the fields that change within episodes.
     """
-    things = [each for each in card.state if each.name in changing]
-    things += [each for each in card.state if each.name in {thing.present for thing in things}]
-    places = [each for each in things if each.kind in ("position", "angle", "presence", *LINES)]
-    columns = _Columns(dict.fromkeys((each.name for each in places), 0))
+    things = [field for field in card.state if field.name in changing]
+    things += [field for field in card.state if field.name in {thing.present for thing in things}]
+    places = [field for field in things if field.kind in ("position", "angle", "presence", *LINES)]
+    columns = _Columns(dict.fromkeys((field.name for field in places), 0))
     if _nodes(places, columns, card) or _bodies(places, columns, card):
-        return tuple(each.name for each in card.state if each.name in columns.taken)
-    sizes = {each.name: math.prod(each.shape) for each in things}
-    return tuple(each.name for each in card.state if 0 < sizes.get(each.name, 0) <= MOST_VALUES)
+        return tuple(field.name for field in card.state if field.name in columns.taken)
+    sizes = {field.name: math.prod(field.shape) for field in things}
+    return tuple(field.name for field in card.state if 0 < sizes.get(field.name, 0) <= MOST_VALUES)
 
 
 class _Columns:
@@ -130,42 +127,42 @@ class _Columns:
         self._starts, self.taken = starts, set[str]()
 
     def of(self, *fields: StateField) -> tuple[int, ...]:
-        self.taken |= {each.name for each in fields}
+        self.taken |= {field.name for field in fields}
         return tuple(
-            self._starts[each.name] + number
-            for each in fields
-            for number in range(math.prod(each.shape))
+            self._starts[field.name] + number
+            for field in fields
+            for number in range(math.prod(field.shape))
         )
 
 
 def _values(fields: Sequence[StateField], columns: _Columns) -> GroupSpec:
-    names = {each.name for each in fields}
-    following = [each for each in fields if each.follows and {*each.follows} <= names]
-    moved = [each for each in fields if each not in following]
+    names = {field.name for field in fields}
+    following = [field for field in fields if field.follows and {*field.follows} <= names]
+    moved = [field for field in fields if field not in following]
     ordered, angles, place = [*moved, *following], list[int](), 0
-    for each in ordered:
-        size = math.prod(each.shape)
-        if each.kind == "angle":
+    for field in ordered:
+        size = math.prod(field.shape)
+        if field.kind == "angle":
             angles += range(place, place + size)
         place += size
-    count = sum(math.prod(each.shape) for each in following)
+    count = sum(math.prod(field.shape) for field in following)
     return GroupSpec("values", columns.of(*ordered), count, tuple(angles))
 
 
 def _nodes(
     fields: Sequence[StateField], columns: _Columns, card: EnvironmentCard
 ) -> GroupSpec | None:
-    lines = [each for each in fields if each.kind in LINES]
+    lines = [field for field in fields if field.kind in LINES]
     if len(lines) != 1 or card.camera is None:
         return None
     axes = lines[0].shape[-1]
-    agents = [each for each in fields if each.kind == "position" and each.entries == axes]
+    agents = [field for field in fields if field.kind == "position" and field.entries == axes]
     if not agents:
         return None
     return GroupSpec(
         "nodes",
         columns.of(*agents, lines[0]),
-        agents=sum(each.rows for each in agents),
+        agents=sum(field.rows for field in agents),
         axes=axes,
         nodes=lines[0].grid,
         camera=card.camera,
@@ -176,20 +173,20 @@ def _nodes(
 def _bodies(
     fields: Sequence[StateField], columns: _Columns, card: EnvironmentCard
 ) -> GroupSpec | None:
-    angles = {each.owners: each for each in fields if each.kind == "angle" and each.owners}
-    positions = [each for each in fields if each.kind == "position"]
-    bodies = [each for each in positions if each.owners in angles]
-    names = {name for each in bodies for name in each.owners}
-    agents = [each for each in positions if each.entries == 2 and not names & {*each.owners}]
+    angles = {field.owners: field for field in fields if field.kind == "angle" and field.owners}
+    positions = [field for field in fields if field.kind == "position"]
+    bodies = [field for field in positions if field.owners in angles]
+    names = {name for field in bodies for name in field.owners}
+    agents = [field for field in positions if field.entries == 2 and not names & {*field.owners}]
     if len(bodies) != 1 or not agents or card.camera is None:
         return None
     body = bodies[0]
     angle = angles[body.owners]
-    present = [each for each in fields if each.name == body.present]
+    present = [field for field in fields if field.name == body.present]
     return GroupSpec(
         "bodies",
         columns.of(*agents, *present, body, angle),
-        agents=sum(each.rows for each in agents),
+        agents=sum(field.rows for field in agents),
         bodies=body.rows,
         folds=FOLDS[angle.symmetry],
         has_presence=bool(present),

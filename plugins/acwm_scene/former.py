@@ -39,7 +39,7 @@ class Former(SceneDynamics):
     def fitted(cls, data: ModelInputs) -> dict[str, Any]:
         """The codec's facts, and the number of values of the states."""
         state = data.environment.state if data.environment else ()
-        fields = {each.name: math.prod(each.shape) for each in state}
+        fields = {field.name: math.prod(field.shape) for field in state}
         return {
             "latent_channels": data.latent_channels,
             "temporal_stride": data.temporal_stride,

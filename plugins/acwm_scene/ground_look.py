@@ -43,4 +43,4 @@ class GroundLook(nn.Module):
         """Map features of cells `[B, C, h, w]` and places `[B, N, 3]` to `[B, N, looks · C]`."""
         aspect = grid.shape[3] / grid.shape[2]
         below = [places[..., :2], *(shadows_of(places, light) for light in self.lights.unbind())]
-        return torch.cat([seen_at(grid, self.view(each, aspect)[..., :2]) for each in below], 2)
+        return torch.cat([seen_at(grid, self.view(spots, aspect)[..., :2]) for spots in below], 2)

@@ -46,10 +46,10 @@ class NodeMotion(nn.Module):
             layout.axes,
             len(layout.shape),
         )
-        told = 2 * agents * waves_size(axes, NEAR) + agents * axes + axes
-        told += waves_size(axes, WIDE[axes]) + 1 + 2 * sides * axes
-        self.tell = nn.Linear(told, channels)
-        self.blocks = nn.ModuleList(NodeBlock(sides, channels, each) for each in REACHES[sides])
+        inputs = 2 * agents * waves_size(axes, NEAR) + agents * axes + axes
+        inputs += waves_size(axes, WIDE[axes]) + 1 + 2 * sides * axes
+        self.tell = nn.Linear(inputs, channels)
+        self.blocks = nn.ModuleList(NodeBlock(sides, channels, reach) for reach in REACHES[sides])
         self.out = nn.Linear(channels, axes)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
@@ -73,8 +73,8 @@ class NodeMotion(nn.Module):
             change = self._changed(form, agents, change, chance)
         else:
             ahead = ahead_of(form.agents)
-            seen = Form(*(seen_from(ahead, each) for each in form))
-            agents, change = (seen_from(ahead, each) for each in (agents, change))
+            seen = Form(*(seen_from(ahead, places) for places in form))
+            agents, change = (seen_from(ahead, places) for places in (agents, change))
             back = ahead * ahead.new_tensor([1.0, -1.0])
             change = seen_from(back, self._changed(seen, agents, change, chance))
         return form.nodes + change, change
@@ -84,12 +84,12 @@ class NodeMotion(nn.Module):
     ) -> Tensor:
         nodes, exact = form.nodes, torch.autocast(agents.device.type, enabled=False)
         away = [
-            waves(each[:, None, number] - nodes, NEAR)
-            for each in (form.agents, agents)
+            waves(places[:, None, number] - nodes, NEAR)
+            for places in (form.agents, agents)
             for number in range(agents.shape[1])
         ]
         moved = ((agents - form.agents) / STEP).flatten(1)[:, None].expand(-1, nodes.shape[1], -1)
-        told = [
+        inputs = [
             *away,
             moved,
             change / STEP,
@@ -98,11 +98,11 @@ class NodeMotion(nn.Module):
             along_sides(nodes, self.shape),
         ]
         with exact:
-            features = self.tell(torch.cat(told, -1))
+            features = self.tell(torch.cat(inputs, -1))
             if self.chance:
                 features = features + self.chance(*chance)[:, None]
         for block in self.blocks:
             features = block(features, self.shape)
         with exact:
-            made = self.out(nn.functional.silu(features.float()))
-        return self.keep * change + STEP * made
+            step = self.out(nn.functional.silu(features.float()))
+        return self.keep * change + STEP * step

@@ -75,8 +75,8 @@ class NodeMap(nn.Module):
             turned.append(facing(now, sides, self.view.eye))
         nodes = self.node(self._told(form.nodes, [*turned, looks]))
         agents = self.agent(self._told(form.agents, [self.agent_look.expand(len(now), -1, -1)]))
-        heard = self.splat(form, nodes.float(), agents.float(), size)
-        return self.mix(heard).transpose(1, 2).unflatten(2, size)
+        cells = self.splat(form, nodes.float(), agents.float(), size)
+        return self.mix(cells).transpose(1, 2).unflatten(2, size)
 
     def _told(self, places: Tensor, further: list[Tensor]) -> Tensor:
         """What is known of things at `[B, frames, N, D]`, of which the last frame is the first."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acwm_scene.agent_sight import AgentSight, Found
+from acwm_scene.agent_sight import AgentPlaces, AgentSight
 from acwm_scene.ground_look import GroundLook
 from acwm_scene.layers import Overview
 from acwm_scene.nodes import (
@@ -81,22 +81,22 @@ class NodeSight(Overview):
             nn.Linear(seen + place, channels), nn.SiLU(), nn.Linear(channels, axes)
         )
         self.tell = nn.Linear(seen + place + 2 * sides * axes, channels)
-        self.blocks = nn.ModuleList(NodeBlock(sides, channels, each) for each in (1, 2, 4))
+        self.blocks = nn.ModuleList(NodeBlock(sides, channels, reach) for reach in (1, 2, 4))
         self.shift = nn.Linear(channels, axes)
 
     def forward(self, frame: Tensor) -> Form:
         """The form that a latent frame `[B, C, h, w]` shows."""
         return self.look(frame)[0][-1]
 
-    def look(self, frame: Tensor) -> tuple[list[Form], Found]:
+    def look(self, frame: Tensor) -> tuple[list[Form], AgentPlaces]:
         """The forms from the first guess to the last one, and how the agents were found."""
         grid = self.features(frame)
         hidden = self.guess(self.summary(grid))
-        found = self.agents(frame)
-        forms = [Form(found.places, self._guessed(hidden, found.places))]
+        located = self.agents(frame)
+        forms = [Form(located.places, self._guessed(hidden, located.places))]
         for _ in range(ROUNDS):
             forms.append(self._corrected(grid.float(), forms[-1]))
-        return forms, found
+        return forms, located
 
     def _guessed(self, hidden: Tensor, agents: Tensor) -> Tensor:
         """A first guess of the nodes, as they are seen from the agents where there are several."""
@@ -109,13 +109,14 @@ class NodeSight(Overview):
         return agents.mean(1, keepdim=True) + seen_from(back, nodes)
 
     def _corrected(self, grid: Tensor, form: Form) -> Form:
-        agents, nodes = (each.detach() for each in form)  # where it looks is not learned by looking
-        seen, shown = self._seen(grid, agents), self._seen(grid, nodes)
-        held, there = (self._held(agents, each) for each in (agents, nodes))
+        # Where it looks is not learned by looking.
+        agents, nodes = (places.detach() for places in form)
+        seen, at_nodes = self._seen(grid, agents), self._seen(grid, nodes)
+        held, there = (self._held(agents, places) for places in (agents, nodes))
         shift = self.agent(torch.cat([seen, waves(held / 2, OCTAVES)], -1))
         size, sides = self._size(agents), along_sides(nodes, self.layout.shape)
-        told = [shown, waves(there / size / 2, OCTAVES), sides / size]
-        features = self.tell(torch.cat(told, -1))
+        inputs = [at_nodes, waves(there / size / 2, OCTAVES), sides / size]
+        features = self.tell(torch.cat(inputs, -1))
         for block in self.blocks:
             features = block(features, self.layout.shape)
         moved = form.nodes + size * self.shift(functional.silu(features)).float()
@@ -146,10 +147,10 @@ class NodeSight(Overview):
         return seen if self.ground is None else torch.cat([seen, self.ground(grid, places)], 2)
 
 
-def form_loss(made: Form, true: Form) -> Tensor:
+def form_loss(predicted: Form, true: Form) -> Tensor:
     """How far off agents and nodes are, `[B]`: by the distance, and not its square."""
     agents, nodes = (
         functional.smooth_l1_loss(mine, real, beta=0.05, reduction="none").flatten(1).mean(1)
-        for mine, real in zip(made, true, strict=True)
+        for mine, real in zip(predicted, true, strict=True)
     )
     return nodes + 0.5 * agents

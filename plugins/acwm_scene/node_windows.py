@@ -48,11 +48,11 @@ def node_windows(true: Form, random: torch.Generator, progress: float, ends: boo
     if not len(chosen):
         chosen = torch.arange(wanted)
     numbers = (starts[chosen, None] + torch.arange(-1, horizon + 1)).clamp(min=0).to(device)
-    window = Form(*(each[rows[chosen, None].to(device), numbers] for each in true))
+    window = Form(*(values[rows[chosen, None].to(device), numbers] for values in true))
     count = len(chosen)
     angle = 2 * math.pi * torch.rand(count, generator=random)
     side = torch.randint(2, (count,), generator=random) * 2 - 1
-    turned = Form(*(_seen_from(each, angle.to(device), side.to(device)) for each in window))
+    turned = Form(*(_seen_from(values, angle.to(device), side.to(device)) for values in window))
     return (
         turned.reversed((torch.rand(count, generator=random) < 0.5).to(device)) if ends else turned
     )
@@ -60,6 +60,6 @@ def node_windows(true: Form, random: torch.Generator, progress: float, ends: boo
 
 def _seen_from(places: Tensor, angle: Tensor, side: Tensor) -> Tensor:
     """Places `[B, T, N, D]` mirrored, where `side` is −1, and turned by `angle` rad."""
-    c, s = (each[:, None, None] for each in (angle.cos(), angle.sin()))
+    c, s = (part[:, None, None] for part in (angle.cos(), angle.sin()))
     x, y = places[..., 0] * side[:, None, None], places[..., 1]
     return torch.cat([torch.stack([c * x - s * y, s * x + c * y], -1), places[..., 2:]], -1)

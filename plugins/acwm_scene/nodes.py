@@ -90,7 +90,7 @@ class NodeLayout:
             place = torch.arange(side, device=nodes.device) / self.every
             below = place.long().clamp(max=max(kept - 2, 0))
             above = (below + 1).clamp(max=kept - 1)
-            first, second = (nodes.index_select(axis, each) for each in (below, above))
+            first, second = (nodes.index_select(axis, rows) for rows in (below, above))
             share = (place - below).view(-1, *[1] * (nodes.ndim - axis - 1))
             nodes = torch.lerp(first, second, share.to(nodes))
         return self.unit * torch.cat([form.agents.flatten(2), nodes.flatten(2)], 2)
@@ -110,9 +110,9 @@ class View(nn.Module):
 
     def __init__(self, camera: Camera, unit: float) -> None:
         super().__init__()
-        self.is_flat = camera.half_height is not None
+        self.is_flat = camera.is_flat
         self.above = -1.0 if camera.eye[2] < 0 else 1.0  # a camera may look up at the plane
-        scale = unit / camera.half_height if camera.half_height else 2 * camera.focal()
+        scale = 2 * camera.scale * (unit if self.is_flat else 1.0)
         rows = torch.tensor(camera.axes) * torch.tensor([[scale], [scale], [1.0]]).double()
         self.register_buffer("axes", rows.float(), persistent=False)
         self.register_buffer("back", torch.linalg.inv(rows).float(), persistent=False)
@@ -159,12 +159,12 @@ def seen_at(grid: Tensor, spots: Tensor) -> Tensor:
 
 def along_sides(nodes: Tensor, shape: tuple[int, ...]) -> Tensor:
     """What separates each node from its neighbours, `[B, N, 2 · sides · D]`; 0 beyond an edge."""
-    found: list[Tensor] = []
+    neighbours: list[Tensor] = []
     grid = nodes.unflatten(1, shape)
     for side in range(1, len(shape) + 1):
         steps, none = grid.diff(dim=side), torch.zeros_like(grid.narrow(side, 0, 1))
-        found += [torch.cat([steps, none], side), torch.cat([none, -steps], side)]
-    return torch.cat(found, -1).flatten(1, len(shape))
+        neighbours += [torch.cat([steps, none], side), torch.cat([none, -steps], side)]
+    return torch.cat(neighbours, -1).flatten(1, len(shape))
 
 
 def facing(nodes: Tensor, sides: Tensor, eye: Tensor) -> Tensor:
@@ -252,5 +252,5 @@ class NodeBlock(nn.Module):
     def forward(self, features: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Map features `[B, N, channels]` to features."""
         grid = self.norm(features).unflatten(1, shape).movedim(-1, 1)
-        heard = nn.functional.silu(self.hear(grid)).movedim(1, -1).flatten(1, len(shape))
-        return features + self.mix(heard)
+        messages = nn.functional.silu(self.hear(grid)).movedim(1, -1).flatten(1, len(shape))
+        return features + self.mix(messages)

@@ -97,10 +97,10 @@ class SceneObjective(Regression):
                 len(batch.latents), -1
             )
         given = torch.arange(known, device=numbers.device).expand(len(numbers), -1)
-        shown = torch.cat([given, known + numbers], 1) if self.motion_steps else None
-        states = model.with_points(states, batch.latents, shown)
-        drawn = model.draw_true(batch.latents[:, :known], states, numbers)
-        pictures = functional.mse_loss(drawn.float(), frames_of(batch, known, numbers).float())
+        read_frames = torch.cat([given, known + numbers], 1) if self.motion_steps else None
+        states = model.with_points(states, batch.latents, read_frames)
+        predicted = model.draw_true(batch.latents[:, :known], states, numbers)
+        pictures = functional.mse_loss(predicted.float(), frames_of(batch, known, numbers).float())
         read = batch.random_frames(min(READ_FRAMES, frames) - 1, frames - 1) + 1
         read = torch.cat([torch.zeros_like(read[:, :1]), read], 1)
         others = model.reading_loss(batch.latents, states, read)

@@ -27,11 +27,6 @@ class Poses(NamedTuple):
     turns: Tensor
 
 
-def direction(angle: Tensor) -> Tensor:
-    """Cosine and sine of an angle, side by side in a last axis."""
-    return torch.stack([angle.cos(), angle.sin()], -1)
-
-
 def turned(vector: Tensor, by: Tensor) -> Tensor:
     """A vector `[…, 2]` turned by the angle whose cosine and sine are `by`, `[…, 2]`."""
     x, y = vector.unbind(-1)
@@ -57,9 +52,3 @@ def waves(values: Tensor, octaves: int) -> Tensor:
 def waves_size(size: int, octaves: int) -> int:
     """Number of features that `waves` makes of `size` values."""
     return size * (1 + 2 * octaves)
-
-
-def angle_between(first: Tensor, second: Tensor) -> Tensor:
-    """The angle in rad from one direction `[…, 2]` to another, `[…, 1]`."""
-    cosine, sine = turned_back(second, first).unbind(-1)
-    return torch.atan2(sine, cosine)[..., None]

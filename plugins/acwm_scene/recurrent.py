@@ -115,7 +115,7 @@ class RecurrentModel(Predictor):
 
     def matrices(self) -> list[nn.Parameter]:
         """The weights of the convolutions in the blocks and in the head."""
-        return [each.weight for each in self.modules() if isinstance(each, MatrixConv)]
+        return [module.weight for module in self.modules() if isinstance(module, MatrixConv)]
 
     def start(self, given: Latent, first: Tensor) -> State:
         """The state after the last of the given frames `[B, K, C, h, w]`.

@@ -113,20 +113,20 @@ class SceneDynamics(Predictor):
         sizes = {"latent_channels": latent_channels, "stride": temporal_stride}
         sizes |= {"channels": channels, "width": width, "noise": noise}
         options = {"stretch": stretch, "unit": unit, "every": every}
-        made = {name: spec.build(**sizes, **options) for name, spec in specs.items()}
+        groups = {name: spec.build(**sizes, **options) for name, spec in specs.items()}
         self.point_size = 0
         if points:
-            made["points"] = group = PointGroup(points, **sizes)
+            groups["points"] = group = PointGroup(points, **sizes)
             self.point_size = group.size
             self.columns["points"] = [*range(state_size, state_size + group.size)]
         self.groups = nn.Module()  # a ModuleDict has an attribute `values` of its own
-        for name, group in made.items():
+        for name, group in groups.items():
             self.groups.add_module(name, group)
         self.drawing = FrameDrawing(latent_channels, channels=channels, width=width, blocks=blocks)
         self.keypoint_names = tuple(
-            name for group in made.values() for name in group.keypoint_names
+            name for group in groups.values() for name in group.keypoint_names
         )
-        self.noise = sum(group.noise for group in made.values())
+        self.noise = sum(group.noise for group in groups.values())
         self.samples = self.noise > 0
 
     @classmethod
@@ -279,7 +279,7 @@ class SceneDynamics(Predictor):
 
     def matrices(self) -> list[nn.Parameter]:
         """The weights of the convolutions in the blocks and in the head that draw."""
-        return [each.weight for each in self.modules() if isinstance(each, MatrixConv)]
+        return [module.weight for module in self.modules() if isinstance(module, MatrixConv)]
 
     def initial_state(
         self, given: Latent, conditioning: Conditioning, *draw: Tensor
@@ -343,8 +343,8 @@ class SceneDynamics(Predictor):
             return states
         if frames is None:
             frames = torch.arange(latents.shape[1], device=latents.device).expand(len(latents), -1)
-        shown = latents.take_along_dim(frames[..., None, None, None], 1)
-        read = self.points.sight(shown.flatten(0, 1)).flatten(1).unflatten(0, frames.shape)
+        chosen = latents.take_along_dim(frames[..., None, None, None], 1)
+        read = self.points.sight(chosen.flatten(0, 1)).flatten(1).unflatten(0, frames.shape)
         whole = read.new_zeros(*latents.shape[:2], self.point_size)
         whole = whole.scatter(1, frames[..., None].expand_as(read), read)
         whole = whole.repeat_interleave(self.stride, 1)[:, self.stride - 1 :]
@@ -473,24 +473,24 @@ class SceneDynamics(Predictor):
 
     def _keypoints(self, courses: Mapping[str, Any], aspect: float) -> Keypoints:
         """Those of all groups; where one has fewer features, 0 without a weight."""
-        found = [
+        keypoints = [
             group.keypoints(courses[name], aspect)
             for name, group in self._groups()
             if group.keypoint_names
         ]
-        if not found:
+        if not keypoints:
             raise RecipeError("this scene knows only values, of which it sees no place")
-        size = max(each.values.shape[-1] for each in found)
+        size = max(part.values.shape[-1] for part in keypoints)
 
         def together(parts: Iterable[Tensor], axis: int) -> Tensor:
             return torch.cat(
-                [functional.pad(each, (0, size - each.shape[-1])) for each in parts], axis
+                [functional.pad(values, (0, size - values.shape[-1])) for values in parts], axis
             )
 
         return Keypoints(
-            together((each.values for each in found), 2),
-            together((each.weights for each in found), 0),
-            torch.cat([each.shares for each in found]),
+            together((part.values for part in keypoints), 2),
+            together((part.weights for part in keypoints), 0),
+            torch.cat([part.shares for part in keypoints]),
         )
 
     def _begun(self, base: Tensor, states: dict[str, Any]) -> Scene:
@@ -519,10 +519,12 @@ class SceneDynamics(Predictor):
         """The latent frames with these numbers, 1 for the first one after the given ones."""
         count = numbers.shape[1]
         rows = numbers[..., None] * self.stride - torch.arange(self.stride, device=numbers.device)
-        shown = {name: flattened(picked(course, rows)) for name, course in courses.items()}
+        picked_courses = {name: flattened(picked(course, rows)) for name, course in courses.items()}
         fixed = (scene.base, scene.canvas, scene.memories)
-        base, canvas, memories = tree_map(lambda each: each.repeat_interleave(count, 0), fixed)
-        return self.draw(Scene(base, canvas, {}, memories), shown).unflatten(0, numbers.shape)
+        base, canvas, memories = tree_map(lambda tensor: tensor.repeat_interleave(count, 0), fixed)
+        return self.draw(Scene(base, canvas, {}, memories), picked_courses).unflatten(
+            0, numbers.shape
+        )
 
     def _drawn(self, given: Latent, generators: Sequence[Generator]) -> Tensor | None:
         """The numbers `[B, noise]` of one of the futures."""

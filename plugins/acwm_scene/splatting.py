@@ -58,8 +58,8 @@ class Splatting(nn.Module):
         self.light = None if light is None else torch.tensor(light, dtype=torch.float32)
         self.points = tuple((side - 1) * POINTS + 1 for side in layout.shape)
         self.texture = nn.Parameter(0.3 * torch.randn(TEXTURE, *self.points))
-        shown = values + TEXTURE + KNOWN + (KNOWN if light else 0)
-        self.channels = shown * frames * FINE**2
+        size = values + TEXTURE + KNOWN + (KNOWN if light else 0)
+        self.channels = size * frames * FINE**2
 
     def forward(self, form: Form, nodes: Tensor, agents: Tensor, size: torch.Size) -> Tensor:
         """What cells hear, `[B, cells, channels]`.
@@ -72,29 +72,29 @@ class Splatting(nn.Module):
         """
         texture = self.texture.flatten(1).T.expand(len(nodes), -1, -1)
         none = texture.new_zeros(*agents.shape[:2], TEXTURE)
-        told = torch.cat([self._between(nodes), texture], 2)
-        told = torch.cat([told, torch.cat([agents, none], 2)], 1)
+        features = torch.cat([self._between(nodes), texture], 2)
+        features = torch.cat([features, torch.cat([agents, none], 2)], 1)
         frames = form.nodes.shape[1]
         points = self._between(form.nodes.flatten(0, 1)).unflatten(0, (-1, frames))
-        heard = [self._splatted(torch.cat([points, form.agents], 2), told, size)]
+        maps = [self._splatted(torch.cat([points, form.agents], 2), features, size)]
         if self.light is not None:
             fallen = shadows_of(points, self.light.to(points))
-            heard.append(self._splatted(fallen, told[:, : fallen.shape[2], :0], size))
-        return torch.cat(heard, 2)
+            maps.append(self._splatted(fallen, features[:, : fallen.shape[2], :0], size))
+        return torch.cat(maps, 2)
 
     def _between(self, values: Tensor) -> Tensor:
         """Values of the nodes `[B, N, V]` at all points, `[B, P, V]`."""
         mode = ("linear", "bilinear")[len(self.shape) - 1]
         grid = values.float().transpose(1, 2).unflatten(2, self.shape)
-        made = functional.interpolate(grid, self.points, mode=mode, align_corners=True)
-        return made.flatten(2).transpose(1, 2)
+        points = functional.interpolate(grid, self.points, mode=mode, align_corners=True)
+        return points.flatten(2).transpose(1, 2)
 
-    def _splatted(self, points: Tensor, shown: Tensor, size: torch.Size) -> Tensor:
+    def _splatted(self, points: Tensor, features: Tensor, size: torch.Size) -> Tensor:
         """What each pixel of the cells shows, `[B, cells, T FINE² (V + KNOWN)]`.
 
         Args:
             points: places in units, `[B, T, P, D]`.
-            shown: what each tells, `[B, P, V]`.
+            features: of each point, `[B, P, V]`.
             size: rows and columns of cells.
         """
         frames, cells = points.shape[1], size[0] * size[1]
@@ -109,8 +109,8 @@ class Splatting(nn.Module):
             share = cover / (total + 1e-12)
             weight = weight * share.gather(1, pixel.flatten(1)).view_as(weight)
             known = torch.stack([far * share, cover], 2)
-        if shown.shape[2]:
-            values = (weight[..., None] * shown[:, None, None]).flatten(1, 3)
+        if features.shape[2]:
+            values = (weight[..., None] * features[:, None, None]).flatten(1, 3)
             blank = values.new_zeros(len(values), pixels.shape[1], values.shape[2])
             seen = blank.scatter_add(1, pixel.flatten(1)[..., None].expand_as(values), values)
             known = torch.cat([seen, known], 2)
@@ -125,11 +125,11 @@ class Splatting(nn.Module):
         seen = self.view(points, size[1] / size[0])
         spots = (seen[..., :2] + 1) * seen.new_tensor([width, height]) / 2 - 0.5
         right, down = torch.tensor([[0, 1, 0, 1], [0, 0, 1, 1]], device=points.device)[..., None]
-        x, y = (each[:, :, None].floor() for each in spots.unbind(-1))
+        x, y = (spot[:, :, None].floor() for spot in spots.unbind(-1))
         x, y = x + right, y + down
         much = (1 - (spots[:, :, None, :, 0] - x).abs()) * (1 - (spots[:, :, None, :, 1] - y).abs())
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        x, y = (each.clamp(0, side - 1).long() for each, side in ((x, width), (y, height)))
+        x, y = (axis.clamp(0, side - 1).long() for axis, side in ((x, width), (y, height)))
         cell = y // FINE * size[1] + x // FINE
         frames = points.shape[1]
         frame = torch.arange(frames, device=points.device)[:, None, None]

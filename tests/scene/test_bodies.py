@@ -17,7 +17,7 @@ from acwm_scene.body_windows import HORIZONS, moving_windows
 from acwm_scene.declared import GroupSpec
 from acwm_scene.group import at_frame
 from acwm_scene.objective import SceneObjective
-from acwm_scene.poses import Poses, direction, turned, turned_back
+from acwm_scene.poses import Poses, turned, turned_back
 from acwm_scene.scene import SceneDynamics
 from tests.scene.dots import follow, learn_motion, world_of
 
@@ -134,13 +134,13 @@ def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():
     still = torch.zeros(1, 3, 2), torch.zeros(1, 3, 1)
 
     def moved(by, *, third=0.0):
-        turn = direction(torch.tensor(by))
+        turn = torch.tensor([math.cos(by), math.sin(by)])
         here = places + third * torch.tensor([0.0, 0.0, 1.0])[None, :, None]
         poses = Poses(
             turned(torch.ones(1, 1, 2), turn),
             there,
             turned(here, turn),
-            direction(4 * (angles + by)),
+            torch.stack([(4 * (angles + by)).cos(), (4 * (angles + by)).sin()], -1),
         )
         moving = Moving(poses, torch.zeros(1, 1, 2), torch.zeros(1, 1, HIDDEN), *still)
         moved = motion(moving, turned(torch.tensor([[[1.2, 0.9]]]), turn))
