@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from acwm_core.data.video import decode_planes
 from acwm_core.env.episode import Split
 from acwm_formats.alignment import PlannedEpisode
-from acwm_formats.reading import Reading, opened
+from acwm_formats.reading import CommonReading, opened
 from acwm_formats.staging import Staged
 from acwm_formats.survey.action_rate import ActionRate, followed
 from acwm_formats.survey.following import Moments
@@ -30,7 +30,7 @@ SAMPLED = 64  # recordings whose video is looked at
 def action_rate(
     kept: Sequence[Staged],
     parts: Parts,
-    reading: Reading,
+    reading: CommonReading,
     folder: Path,
     *,
     again: bool,
@@ -43,24 +43,24 @@ def action_rate(
         reading: how they were read.
         again: whether recordings may be opened again, to find out what the video follows.
     """
-    others = [each.scan for each in kept if each.scan.unused or each.scan.per_frame != 1]
+    others = [file.scan for file in kept if file.scan.unused or file.scan.per_frame != 1]
     if not others:
         return None
-    rates = [each.per_frame for each in others]
-    unused = float(np.median([each.unused for each in others]))
+    rates = [scan.per_frame for scan in others]
+    unused = float(np.median([scan.unused for scan in others]))
     kinds = reading.alignment.kinds
     stated, most = bool(kinds), kinds or ("absolute",)
-    found = ActionRate((min(rates), max(rates)), unused, most, stated)
-    if not (found.is_open and again):
-        return found
+    rate = ActionRate((min(rates), max(rates)), unused, most, stated)
+    if not (rate.is_open and again):
+        return rate
     pairs = list(_pairs(kept, parts, reading, folder))
     values, sums = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    follows, told = followed(values, sums)
-    return replace(found, follows=follows, told=(round(told[0], 3), round(told[1], 3)))
+    follows, shares = followed(values, sums)
+    return replace(rate, follows=follows, told=(round(shares[0], 3), round(shares[1], 3)))
 
 
 def _pairs(
-    kept: Sequence[Staged], parts: Parts, reading: Reading, folder: Path
+    kept: Sequence[Staged], parts: Parts, reading: CommonReading, folder: Path
 ) -> Iterator[tuple[Moments, Moments]]:
     """The same stretch with the values at the frames and with the means over them."""
     summing = replace(reading, alignment=replace(reading.alignment, kinds=("velocity",)))
@@ -68,7 +68,7 @@ def _pairs(
         scan, files = kept[place]
         recording = opened(parts[scan.split][0], scan.index, scan.name, reading.fps)
         held, summed = reading.planned(recording).episodes, summing.planned(recording).episodes
-        index = int(np.argmax([len(each.actions) for each in held]))
+        index = int(np.argmax([len(episode.actions) for episode in held]))
         both = _common(held[index], summed, reading.cameras[0])
         if both is None:
             continue
@@ -87,12 +87,12 @@ def _common(
     episode: PlannedEpisode, others: Sequence[PlannedEpisode], camera: str
 ) -> tuple[int, NDArray[np.float32], NDArray[np.float32]] | None:
     """The first frame that an episode shares with another plan of it, and the actions of both."""
-    shown = episode.frames[camera]
+    own = episode.frames[camera]
     for other in others:
-        places = np.flatnonzero(shown == other.frames[camera][0])
+        places = np.flatnonzero(own == other.frames[camera][0])
         count = len(other.actions)
         for first in places.tolist():
-            if np.array_equal(shown[first : first + count], other.frames[camera]):
+            if np.array_equal(own[first : first + count], other.frames[camera]):
                 rows = slice(first, first + count - 1)
                 return first, episode.actions[rows], other.actions[:-1]
     return None

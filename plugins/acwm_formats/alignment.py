@@ -109,12 +109,12 @@ class Aligned:
     rate: float = 0.0
     seconds: float = 0.0
 
-    def found(self, problem: str, option: str = TRIM) -> None:
+    def add_defect(self, problem: str, option: str = TRIM) -> None:
         """Add a defect."""
         self.defects.append(Defect(self.name, problem, option))
 
 
-class _Stream(NamedTuple):
+class _Samples(NamedTuple):
     """Samples with increasing times: values, or the places of frames."""
 
     times: NDArray[np.float64]
@@ -141,31 +141,31 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
         cameras: those to show; the first one gives the moments.
         options: how.
     """
-    found = Aligned(recording.name, notes=[*recording.notes])
+    aligned = Aligned(recording.name, notes=[*recording.notes])
     try:
-        frames = {name: _frame_stream(found, name, recording.cameras[name]) for name in cameras}
+        frames = {name: _frame_stream(aligned, name, recording.cameras[name]) for name in cameras}
         main = frames[cameras[0]]
         if len(main.times) < 2:
-            found.found(
+            aligned.add_defect(
                 f"it has {len(main.times)} usable frames, and an action needs the next one", ""
             )
-            return found
+            return aligned
         seconds = float(main.times[-1] - main.times[0])
         _check_span(seconds, 1 / main.step)
         _check_span(seconds, float(options.fps or 0))
         measured = cadence(main.times)
-        found.rate, found.seconds = measured.rate, float(main.times[-1] - main.times[0])
-        said = _compare(found, recording, measured, options)
-        grid = _grid(found, main, measured, options)
-        rows = _Rows(found, main.times, measured)
+        aligned.rate, aligned.seconds = measured.rate, float(main.times[-1] - main.times[0])
+        said = _compare(aligned, recording, measured, options)
+        grid = _grid(aligned, main, measured, options)
+        rows = _Rows(aligned, main.times, measured)
         actions = rows.stream("action", _rows_of(recording.actions), last=False)
         states = {n: rows.stream(n, samples) for n, samples in recording.states.items()}
         grid = _Grid(grid.times[grid.times < main.times[said]], grid.step) if said else grid
-        _plan(found, grid, frames, actions, states, options)
+        _plan(aligned, grid, frames, actions, states, options)
     except DataError as error:
-        found.episodes.clear()
-        found.found(str(error), "")
-    return found
+        aligned.episodes.clear()
+        aligned.add_defect(str(error), "")
+    return aligned
 
 
 def _check_span(seconds: float, rate: float) -> None:
@@ -177,40 +177,40 @@ def _check_span(seconds: float, rate: float) -> None:
         )
 
 
-def _frame_stream(found: Aligned, name: str, frames: Frames) -> _Stream:
+def _frame_stream(aligned: Aligned, name: str, frames: Frames) -> _Samples:
     times = frames.times
-    return _sound(found, f"camera {name}", _Stream(times, np.arange(len(times))))
+    return _sound(aligned, f"camera {name}", _Samples(times, np.arange(len(times))))
 
 
-def _sound(found: Aligned, what: str, stream: _Stream) -> _Stream:
+def _sound(aligned: Aligned, what: str, stream: _Samples) -> _Samples:
     """The stream without samples whose times are none, stand still or go back, which are told."""
     kept, problems = faults(stream.times)
     for problem in problems:
-        found.found(f"{what}: {problem}")
-    return _Stream(stream.times[kept], stream.values[kept])
+        aligned.add_defect(f"{what}: {problem}")
+    return _Samples(stream.times[kept], stream.values[kept])
 
 
 def _compare(
-    found: Aligned, recording: TimedRecording, measured: Cadence, options: Alignment
+    aligned: Aligned, recording: TimedRecording, measured: Cadence, options: Alignment
 ) -> int | None:
     """Compare what the source claims with what its frames show; says how many of them count."""
     said, count, slots = recording.length, len(measured.slots), measured.places
     if said is not None and said not in (count, slots, slots + measured.late):
-        found.found(f"it claims {said} frames, but has {count}")
+        aligned.add_defect(f"it claims {said} frames, but has {count}")
     if recording.rate and options.fps is None and not measured.is_at(recording.rate):
         rates = f"{float(recording.rate):g} frames/s, but has {measured.rate:.4g}"
-        found.found(f"it claims {rates}", "--fps")
+        aligned.add_defect(f"it claims {rates}", "--fps")
     return said if said is not None and 2 <= said < count else None
 
 
-def _grid(found: Aligned, frames: _Stream, measured: Cadence, options: Alignment) -> _Grid:
+def _grid(aligned: Aligned, frames: _Samples, measured: Cadence, options: Alignment) -> _Grid:
     if options.fps is not None and not measured.is_at(options.fps):
         step = 1 / float(options.fps)
         length = frames.times[-1] - frames.times[0] + measured.step
         count = int(np.ceil(length / step - options.tolerance * measured.step / step))
         return _Grid(frames.times[0] + step * np.arange(count), step)
     if measured.irregular and options.fps is None:
-        found.found(f"its frame rate is not constant: {measured.irregular}", "--fps")
+        aligned.add_defect(f"its frame rate is not constant: {measured.irregular}", "--fps")
     moments = np.arange(measured.places)
     return _Grid(np.interp(moments, measured.slots, frames.times), measured.step)
 
@@ -221,8 +221,8 @@ class _Rows:
     Frames are counted in two ways: as they are, and with those that were lost.
     """
 
-    def __init__(self, found: Aligned, times: NDArray[np.float64], measured: Cadence) -> None:
-        self._found, self._measured = found, measured
+    def __init__(self, aligned: Aligned, times: NDArray[np.float64], measured: Cadence) -> None:
+        self._aligned, self._measured = aligned, measured
         whole = np.arange(-measured.late, measured.places)
         steps = times[0] + measured.step * whole
         self._slots = np.where(
@@ -230,7 +230,7 @@ class _Rows:
         )
         self._late, self._frames = measured.late, times
 
-    def stream(self, name: str, samples: Samples, *, last: bool = True) -> _Stream:
+    def stream(self, name: str, samples: Samples, *, last: bool = True) -> _Samples:
         """The samples of `name` as a stream; without `last`, the last frame needs no row."""
         values = _numbers(name, samples.values)
         if not last and samples.times is None and len(values) > 1:
@@ -246,12 +246,12 @@ class _Rows:
                 raise DataError(f"{name} has {len(values)} rows and {len(times)} times")
         else:
             times, values = self._placed(name, samples, values, last)
-        stream = _sound(self._found, name, _Stream(times, values))
+        stream = _sound(self._aligned, name, _Samples(times, values))
         finite = _finite(stream.values)
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
-            self._found.found(f"{name} is not finite in row {row}, dimension {column}")
-            stream = _Stream(stream.times[finite.all(1)], stream.values[finite.all(1)])
+            self._aligned.add_defect(f"{name} is not finite in row {row}, dimension {column}")
+            stream = _Samples(stream.times[finite.all(1)], stream.values[finite.all(1)])
         if not len(stream.times):
             raise DataError(f"{name} has no usable row")
         return stream
@@ -267,7 +267,7 @@ class _Rows:
                     f"{name} has {len(values)} rows and {len(numbers)} numbers of frames"
                 )
             if len(numbers) and (numbers.min() < 0 or np.any(np.diff(numbers) < 0)):
-                self._found.found(f"{name}: the numbers of frames go back")
+                self._aligned.add_defect(f"{name}: the numbers of frames go back")
                 numbers = np.maximum.accumulate(np.maximum(numbers, 0))
         places = self._places(name, int(numbers[-1]) + 1 if len(numbers) else 0, last)
         inside = numbers < len(places)
@@ -279,7 +279,9 @@ class _Rows:
         for places in (*ways, *([] if last else [way[:-1] for way in ways])):
             if len(places) == count:
                 return places
-        self._found.found(f"{name} has {count} rows, and the video {len(self._frames)} frames")
+        self._aligned.add_defect(
+            f"{name} has {count} rows, and the video {len(self._frames)} frames"
+        )
         return self._slots[self._late :]
 
 
@@ -304,28 +306,30 @@ def _numbers(name: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _plan(
-    found: Aligned,
+    aligned: Aligned,
     grid: _Grid,
-    frames: Mapping[str, _Stream],
-    actions: _Stream,
-    states: Mapping[str, _Stream],
+    frames: Mapping[str, _Samples],
+    actions: _Samples,
+    states: Mapping[str, _Samples],
     options: Alignment,
 ) -> None:
     """Look all streams up on the grid, and cut it where one of them has nothing."""
-    chosen = {name: _held(found, f"camera {name}", s, grid, options) for name, s in frames.items()}
-    taken, acting = _acted(found, actions, grid, options)
-    seen = {name: _held(found, name, stream, grid, options) for name, stream in states.items()}
+    chosen = {
+        name: _held(aligned, f"camera {name}", s, grid, options) for name, s in frames.items()
+    }
+    taken, acting = _acted(aligned, actions, grid, options)
+    seen = {name: _held(aligned, name, stream, grid, options) for name, stream in states.items()}
     whole = np.ones(len(grid.times), bool)
     for _, known in (*chosen.values(), *seen.values()):
         whole &= known
     acting[-1] = True  # it leads to no frame
     runs = _runs(whole, acting)
-    _tell_cuts(found, grid, runs, options)
+    _tell_cuts(aligned, grid, runs, options)
     for start, stop in runs:
         part = slice(start, stop)
         rows = taken[part].astype(np.float32)
         rows[-1] = 0
-        found.episodes.append(
+        aligned.episodes.append(
             PlannedEpisode(
                 {name: values[part] for name, (values, _) in chosen.items()},
                 rows,
@@ -350,27 +354,29 @@ def _runs(whole: NDArray[np.bool_], acting: NDArray[np.bool_]) -> list[tuple[int
 
 
 def _tell_cuts(
-    found: Aligned, grid: _Grid, runs: Sequence[tuple[int, int]], options: Alignment
+    aligned: Aligned, grid: _Grid, runs: Sequence[tuple[int, int]], options: Alignment
 ) -> None:
     """Tell what lies outside the runs; more than a few frames are a defect."""
     if not runs:
-        found.found("frames, actions and states overlap in fewer than two moments", "")
+        aligned.add_defect("frames, actions and states overlap in fewer than two moments", "")
         return
-    count, known = len(grid.times), bool(found.defects)
+    count, known = len(grid.times), bool(aligned.defects)
     first = runs[0][0] - max(options.shift, 0)  # a shift leaves out as many, as it was asked to
     last = count - runs[-1][1] - max(-options.shift, 0)
     for missing, where in ((first, "first"), (last, "last")):
         if missing > options.max_gap and not known:
-            found.found(f"its {where} {missing} of {count} frames lack actions, states or a camera")
+            aligned.add_defect(
+                f"its {where} {missing} of {count} frames lack actions, states or a camera"
+            )
         elif missing > 0:
-            found.notes.append(f"its {where} {missing} of {count} frames were left out")
+            aligned.notes.append(f"its {where} {missing} of {count} frames were left out")
     for (_, stop), (start, _) in itertools.pairwise(runs):
         seconds = grid.times[start] - grid.times[stop - 1]
-        found.found(f"frames or actions are missing for {seconds:.3g} s", GAP)
+        aligned.add_defect(f"frames or actions are missing for {seconds:.3g} s", GAP)
 
 
 def _held(
-    found: Aligned, name: str, stream: _Stream, grid: _Grid, options: Alignment
+    aligned: Aligned, name: str, stream: _Samples, grid: _Grid, options: Alignment
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The latest sample at each moment, and whether there is one."""
     step = stream.step or grid.step
@@ -384,20 +390,20 @@ def _held(
     known = (place >= 0) & ((place < last) | ~due)
     known &= ~lost | (hole <= options.max_gap * grid.step + slack)
     if filled := int(np.sum(lost & known)):
-        found.notes.append(f"{filled} missing of {name} were filled with the value before")
+        aligned.notes.append(f"{filled} missing of {name} were filled with the value before")
     return stream.values[before], known
 
 
 def _acted(
-    found: Aligned, actions: _Stream, grid: _Grid, options: Alignment
+    aligned: Aligned, actions: _Samples, grid: _Grid, options: Alignment
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The action from each moment to the next, and whether there is one."""
-    taken, known = _held(found, "action", actions, grid, options)
+    taken, known = _held(aligned, "action", actions, grid, options)
     taken = taken.astype(np.float64)
-    found.per_frame, found.unused = _per_frame(actions, grid, options.tolerance)
+    aligned.per_frame, aligned.unused = _per_frame(actions, grid, options.tolerance)
     step = actions.step or grid.step
     differs = abs(step / grid.step - 1) > SAME + options.tolerance / len(grid.times)
-    if found.unused or differs:
+    if aligned.unused or differs:
         kinds = options.kinds or ("absolute",)
         kinds = kinds * (taken.shape[1] if len(kinds) == 1 else 1)
         if len(kinds) != taken.shape[1]:
@@ -419,7 +425,7 @@ def _acted(
     return taken, known
 
 
-def _per_frame(actions: _Stream, grid: _Grid, tolerance: float) -> tuple[float, float]:
+def _per_frame(actions: _Samples, grid: _Grid, tolerance: float) -> tuple[float, float]:
     """Actions per moment of the grid, and the share that is at none of them.
 
     They are 1 and 0 if, but for the error of clocks, each moment has its own.
@@ -438,7 +444,7 @@ def _per_frame(actions: _Stream, grid: _Grid, tolerance: float) -> tuple[float, 
     return (grid.step / step if slow and empty > 1 else 1.0), 0.0
 
 
-def _counts(actions: _Stream) -> NDArray[np.float64]:
+def _counts(actions: _Samples) -> NDArray[np.float64]:
     """How many actions each sample stands for ``[N, 1]``: more than one if the next were lost."""
     steps = np.diff(actions.times) / (actions.step or 1.0)
     places = np.rint(steps)

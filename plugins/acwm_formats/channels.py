@@ -40,7 +40,7 @@ def channels_of(images: Sequence[Any], image: Callable[[Any], NDArray[Any]]) -> 
         one = channels_last(image(images[place]))
         two = channels_last(image(images[min(place + 1, len(images) - 1)]))
         count = two.shape[2]
-        opaque = opaque and all(_is_full(each[..., -1]) for each in (one, two))
+        opaque = opaque and all(_is_full(image[..., -1]) for image in (one, two))
         if (two == two[..., :1]).all() and (one == one[..., :1]).all():
             continue  # grey: it does not tell moments from colours
         varied = True
@@ -73,8 +73,8 @@ def named(name: str, channels: Channels | None) -> Channels | None:
 
 def coloured(image: NDArray[Any], channels: Channels) -> NDArray[Any]:
     """A frame of three or four channels as colours: of a stack, the newest moment in grey."""
-    shown = channels_last(image)
+    pixels = channels_last(image)
     if channels in ("rgb", "rgba"):
-        return shown
-    newest = shown[..., -1:] if channels == "newest-last" else shown[..., :1]
+        return pixels
+    newest = pixels[..., -1:] if channels == "newest-last" else pixels[..., :1]
     return np.repeat(newest, 3, axis=2)

@@ -110,8 +110,8 @@ def _check_manifest(folder: Path, card: DatasetCard, split: Split) -> None:
     sums: dict[str, str] = {**card.checksums}
     same = sums.get(split, manifest.checksum()) == manifest.checksum()
     expect(same, "the checksums are not those that the card records")
-    said, found = card.actions.get(split), action_statistics(records)
-    same = said is None or _close(said, found)
+    said, actual = card.actions.get(split), action_statistics(records)
+    same = said is None or _close(said, actual)
     expect(same, "the actions' statistics are not those that the card records")
     known = {record.shard for record in records} | {MANIFEST}
     others = sorted({file.name for file in folder.iterdir() if file.name[0] != "."} - known)
@@ -129,8 +129,8 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
     reader = open_shard(path)
     numbers = range(record.first, record.first + record.episodes)
     wanted = [f"{split}-{index:06d}.{name}" for index in numbers for name in MEMBERS]
-    for found, name in itertools.zip_longest(reader.names, wanted):
-        expect(found == name, f"it holds {found!r} where {name!r} must be")
+    for name, expected in itertools.zip_longest(reader.names, wanted):
+        expect(name == expected, f"it holds {name!r} where {expected!r} must be")
     for position, index in enumerate(numbers):
         about = reader.about(position)
         same = about["spec"] == json.loads(json.dumps(card.spec(split, index).to_dict()))

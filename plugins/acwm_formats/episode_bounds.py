@@ -24,7 +24,7 @@ _ALSO = ("seq", "sequence", "path", "run", "clip", "game", "segment", "session",
 
 def _names(*parts: str) -> frozenset[str]:
     whose = (*_WHOSE, *_ALSO)
-    return frozenset(f"{each}_{part}" for each, part in itertools.product(whose, parts))
+    return frozenset(f"{owner}_{part}" for owner, part in itertools.product(whose, parts))
 
 
 LENGTHS = _names("len", "lens", "length", "lengths", "size", "sizes") | {"lengths"}
@@ -65,7 +65,7 @@ def tells(name: str) -> bool:
 
 
 def bounds_of(
-    found: Mapping[str, NDArray[Any]], count: int, where: str, *, flags: bool = True
+    candidates: Mapping[str, NDArray[Any]], count: int, where: str, *, flags: bool = True
 ) -> Bounds | None:
     """The episodes in `count` rows; None if no array says that there are several.
 
@@ -78,7 +78,7 @@ def bounds_of(
     Raises:
         DataError: they contradict each other or the number of rows.
     """
-    arrays = {plain(name): np.asarray(values) for name, values in found.items()}
+    arrays = {plain(name): np.asarray(values) for name, values in candidates.items()}
     for name in [name for name in arrays if name in EDGES]:
         arrays |= _as_starts_and_ends(arrays.pop(name))
     flat = {name: v for name, v in arrays.items() if v.ndim == 1 or v.shape[1:] == (1,)}

@@ -125,17 +125,17 @@ class VideoFrames:
         """As in `Frames`."""
         index = video_index(self.path)
         wanted = index.ticks[self.first : self.stop][np.asarray(indices, np.int64)].tolist()
-        frames, shown, image = _decoded(self.path, wanted[0]), None, np.zeros(0, np.uint8)
+        frames, position, image = _decoded(self.path, wanted[0]), None, np.zeros(0, np.uint8)
         reformatter = VideoReformatter()  # shared, as its setup takes longer than a frame
         for tick in wanted:
-            while shown is None or shown < tick:
+            while position is None or position < tick:
                 frame = next(frames, None)
                 if frame is None:
                     raise DataError(f"the video {self.path} ends before {_at(index, tick)}")
                 if frame.pts is not None and frame.pts >= tick:
-                    shown = frame.pts
+                    position = frame.pts
                     image = self._pixels(frame, index, depth_range, reformatter)
-            if shown != tick:
+            if position != tick:
                 raise DataError(f"the video {self.path} has no frame {_at(index, tick)}")
             yield image
 
@@ -154,11 +154,11 @@ class VideoFrames:
         clear = any(component.is_alpha for component in frame.format.components)
         kind = "rgba" if clear else "rgb24"
         try:
-            shown = reformatter.reformat(frame, format=kind, height=size[0], width=size[1])
+            scaled = reformatter.reformat(frame, format=kind, height=size[0], width=size[1])
         except FFmpegError as error:
             how = f"its pixels, {frame.format.name}, cannot be converted ({error.strerror})"
             raise DataError(f"the video {self.path} cannot be read: {how}") from error
-        image = to_rgb(shown.to_ndarray())
+        image = to_rgb(scaled.to_ndarray())
         return np.ascontiguousarray(np.rot90(image, index.turns)) if index.turns else image
 
 
@@ -352,7 +352,7 @@ class ImageFrames:
         return _image(self.images[0])
 
     @functools.cached_property
-    def shown(self) -> Channels | None:
+    def colour_order(self) -> Channels | None:
         """What the channels are; None if they are grey, depth, or those that a file of one names.
 
         Raises:
@@ -383,7 +383,7 @@ class ImageFrames:
     ) -> Iterator[NDArray[np.uint8]]:
         """As in `Frames`."""
         pixel_range = self.pixel_range or guessed_range(self._first)
-        channels = self.shown
+        channels = self.colour_order
         for index in indices:
             image = _image(self.images[index])
             image = image if channels is None else coloured(image, channels)
@@ -417,9 +417,9 @@ def stack_note(frames: Iterable[object]) -> list[str]:
     """
     stacks = {
         STACKED.format(
-            channels=each.shown, count=channels_last(np.asarray(each.images[0])).shape[2]
+            channels=stack.colour_order, count=channels_last(np.asarray(stack.images[0])).shape[2]
         )
-        for each in frames
-        if isinstance(each, ImageFrames) and each.shown in ("newest-last", "newest-first")
+        for stack in frames
+        if isinstance(stack, ImageFrames) and stack.colour_order in ("newest-last", "newest-first")
     }
     return sorted(stacks)

@@ -216,7 +216,7 @@ def _splits(
     reader: Callable[[dict[int, StoredEpisode]], Recordings],
 ) -> Recordings | dict[Split, Recordings]:
     """The episodes by split, if the files say it, and else all."""
-    found: dict[Split | None, list[StoredEpisode]] = {}
+    by_split: dict[Split | None, list[StoredEpisode]] = {}
     damaged: list[StoredEpisode] = []
     known, own_files = set[Identity](), {os.path.realpath(path) for path in files}
     for path in files:
@@ -228,17 +228,19 @@ def _splits(
         own = path.stem if layout.name == "acwm" and path.stem in SPLITS else None
         for name, episodes in groups.items():
             of_tests = tests and tests.get(name.split("/")[-1], "train")
-            found.setdefault(cast(Split | None, own or of_tests), []).extend(episodes)
-    if damaged and found:
-        found.setdefault(None if None in found else "train", []).extend(damaged)
-    if damaged and not found:
+            by_split.setdefault(cast(Split | None, own or of_tests), []).extend(episodes)
+    if damaged and by_split:
+        by_split.setdefault(None if None in by_split else "train", []).extend(damaged)
+    if damaged and not by_split:
         raise DataError(damaged[0].problem)
-    if not found:
+    if not by_split:
         what = " and ".join((layout.actions, *layout.cameras.values()))
         raise DataError(f"{files[0]} has no group with {what}")
-    if None in found:
-        return reader(dict(enumerate(itertools.chain(*found.values()))))
-    return {split: reader(dict(enumerate(each))) for split, each in found.items() if split}
+    if None in by_split:
+        return reader(dict(enumerate(itertools.chain(*by_split.values()))))
+    return {
+        split: reader(dict(enumerate(episodes))) for split, episodes in by_split.items() if split
+    }
 
 
 def _contents(
@@ -257,8 +259,8 @@ def _contents(
         names = [
             name
             for name in episode_groups(file, layout)
-            if (found := identity(file[name])) not in known
-            and (found[0] == os.path.realpath(path) or found[0] not in others)
+            if (own := identity(file[name])) not in known
+            and (own[0] == os.path.realpath(path) or own[0] not in others)
         ]
         known |= {identity(file[name]) for name in names}
         groups: dict[str, list[StoredEpisode]] = {}

@@ -65,36 +65,36 @@ def array(group: Any, name: str) -> Any:
     Raises:
         DataError: there is none, or it claims more than is read.
     """
-    found = group.get(name)
-    if not isinstance(found, h5py.Dataset):
+    dataset = group.get(name)
+    if not isinstance(dataset, h5py.Dataset):
         raise DataError(f"{group.file.filename} has no array {group.name.rstrip('/')}/{name}")
-    row = math.prod(found.shape[1:]) * found.dtype.itemsize
-    if row > MOST_BYTES or found.shape[:1] > (MOST_FRAMES,):
-        where = f"{found.name} in {group.file.filename}"
-        raise DataError(f"{where} claims to be {list(found.shape)}, which is more than is read")
-    return found
+    row = math.prod(dataset.shape[1:]) * dataset.dtype.itemsize
+    if row > MOST_BYTES or dataset.shape[:1] > (MOST_FRAMES,):
+        where = f"{dataset.name} in {group.file.filename}"
+        raise DataError(f"{where} claims to be {list(dataset.shape)}, which is more than is read")
+    return dataset
 
 
-def values_of(found: Any, rows: slice | tuple[()] = ()) -> Any:
+def values_of(dataset: Any, rows: slice | tuple[()] = ()) -> Any:
     """What a dataset holds, or some of its rows.
 
     Raises:
         ValueError: it claims far more than the file stores.
     """
-    stored = 0 if found.external else found.id.get_storage_size()  # which claims its own size
-    check_unpacked(stored, found.size * found.dtype.itemsize)
-    return found[rows]
+    stored = 0 if dataset.external else dataset.id.get_storage_size()  # which claims its own size
+    check_unpacked(stored, dataset.size * dataset.dtype.itemsize)
+    return dataset[rows]
 
 
 def episode_groups(file: Any, layout: ArrayLayout) -> list[str]:
     """The groups that hold what the layout names, in natural order."""
-    found = [
+    names = [
         name
         for name in _groups(file)
         if layout.actions in (group := file[name])
         and all(path in group for path in layout.cameras.values())
     ]
-    return sorted(found, key=natural)
+    return sorted(names, key=natural)
 
 
 def partial_groups(file: Any, layout: ArrayLayout) -> list[str]:
@@ -127,9 +127,9 @@ def _groups(file: Any) -> Iterator[str]:
 
 def _below(group: Any) -> list[tuple[str, Any]]:
     """A group and those below it in the same file, by their names in it."""
-    found = [("", group)]
-    group.visititems(lambda name, item: found.append((name, item)) if _is_group(item) else None)
-    return found
+    groups = [("", group)]
+    group.visititems(lambda name, item: groups.append((name, item)) if _is_group(item) else None)
+    return groups
 
 
 def identity(item: Any) -> tuple[str, int]:
@@ -142,12 +142,12 @@ def layout_of(file: Any) -> ArrayLayout | None:
     if file.attrs.get("format") == "acwm":
         return _acwm_layout(file)
     data = file.get("data")
-    if isinstance(data, h5py.Group) and len(data) and (found := _robomimic_layout(data)):
-        return found
+    if isinstance(data, h5py.Group) and len(data) and (layout := _robomimic_layout(data)):
+        return layout
     if "action" in file and "observations/images" in file:
         return _aloha_layout(file)
-    places = (each for each in (file, data) if isinstance(each, h5py.Group))
-    return next((found for place in places if (found := _concatenated_layout(place))), None)
+    places = (place for place in (file, data) if isinstance(place, h5py.Group))
+    return next((layout for place in places if (layout := _concatenated_layout(place))), None)
 
 
 def _acwm_layout(file: Any) -> ArrayLayout | None:
@@ -227,15 +227,15 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
         for prefix, part in parts:
             if not _is_group(part):
                 continue
-            found = {
+            arrays = {
                 _qualified(prefix, name): values_of(item)
                 for name, item in part.items()
                 if isinstance(item, h5py.Dataset)
                 and item.ndim in (1, 2)
                 and tells(_qualified(prefix, name))
             }
-            where = f"{group.file.filename} ({', '.join(found)})"
-            if found and (bounds := bounds_of(found, count, where, flags=alone)):
+            where = f"{group.file.filename} ({', '.join(arrays)})"
+            if arrays and (bounds := bounds_of(arrays, count, where, flags=alone)):
                 return bounds
     return None
 

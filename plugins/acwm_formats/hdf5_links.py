@@ -75,21 +75,21 @@ def open_plain(path: Path) -> Any:
 
 def external_links(group: Any) -> list[tuple[str, Any]]:
     """The links of a group, and of those below it, that lead to other HDF5 files, by name."""
-    found: list[tuple[str, Any]] = []
+    links: list[tuple[str, Any]] = []
 
     def look(name: str, link: Any) -> None:
         if isinstance(link, h5py.ExternalLink):
-            found.append((name, link))
+            links.append((name, link))
 
     group.visititems_links(look)
-    return found
+    return links
 
 
 def _others(
     file: Any, within: Path | None, limit: str | None, known: set[tuple[str, str]]
 ) -> list[tuple[str, str]]:
     """The HDF5 files, and arrays in them, that a file refers to and that are not yet known."""
-    found: list[tuple[str, str]] = []
+    references: list[tuple[str, str]] = []
     for reference in _references(file):
         path = os.path.realpath(reference.path)
         if reference.size is None and (path, reference.array) in known:
@@ -104,10 +104,10 @@ def _others(
             raise DataError(f"{who}, which cannot be read ({error.strerror})") from None
         if reference.size is None:
             known.add((path, reference.array))
-            found.append((path, reference.array))
+            references.append((path, reference.array))
         elif there < reference.size:
             raise DataError(f"{who}, which has {there:,} bytes, not {reference.size:,}")
-    return found
+    return references
 
 
 def _references(file: Any) -> Iterator[Reference]:
@@ -124,14 +124,14 @@ def _references(file: Any) -> Iterator[Reference]:
             yield Reference(name, Path(os.fsdecode(stored)).absolute(), size=offset + taken)
             rest -= taken
         if described.get_layout() == h5py.h5d.VIRTUAL:
-            for source, shown in _sources(described):
+            for source, target in _sources(described):
                 if _NUMBERED.search(source):
                     raise DataError(
                         f"{file.filename} shows in {name} a numbered series of files, {source}: "
                         "copy their data into it"
                     )
                 path = Path(file.filename) if source == "." else beside / source
-                yield Reference(name, path, shown)
+                yield Reference(name, path, target)
 
 
 def _sources(described: Any) -> list[tuple[str, str]]:
@@ -145,11 +145,11 @@ def _sources(described: Any) -> list[tuple[str, str]]:
 
 def _arrays(file: Any) -> list[bytes]:
     """The names of all datasets of a file."""
-    found: list[bytes] = []
+    names: list[bytes] = []
 
     def look(name: bytes, info: Any) -> None:
         if info.type == h5py.h5o.TYPE_DATASET:
-            found.append(name)
+            names.append(name)
 
     h5py.h5o.visit(file.id, look, info=True)
-    return found
+    return names

@@ -94,7 +94,7 @@ def texts(group: Any) -> dict[str, str]:
 
     Long ones, such as the source of a simulator's model, are left out.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     items = [*group.attrs.items()] + [
         (name, values_of(item) if item.ndim == 0 else values_of(item)[0])
         for name, item in group.items()
@@ -108,8 +108,8 @@ def texts(group: Any) -> dict[str, str]:
     for name, value in items:
         text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
         if isinstance(text, str) and 0 < len(text) <= LONGEST:
-            found[name] = text
-    return found
+            texts[name] = text
+    return texts
 
 
 def shared_file(path: Path, within: Path | None) -> Any:

@@ -76,16 +76,16 @@ def to_rgb(
     Raises:
         DataError: it is no image, or an option is needed to read it.
     """
-    shown = channels_last(image)
-    if is_depth(shown):
-        grey = _nearness(shown[..., 0], depth_range)
+    pixels = channels_last(image)
+    if is_depth(pixels):
+        grey = _nearness(pixels[..., 0], depth_range)
         return np.repeat(grey[..., None], 3, axis=2)
-    if shown.dtype != np.uint8:
-        shown = _eight_bits(shown, pixel_range)
-    if shown.shape[2] == 4:
-        opacity = shown[..., 3:].astype(np.uint16)
-        shown = ((shown[..., :3] * opacity + 127) // 255).astype(np.uint8)
-    return np.repeat(shown, 3, axis=2) if shown.shape[2] == 1 else np.ascontiguousarray(shown)
+    if pixels.dtype != np.uint8:
+        pixels = _eight_bits(pixels, pixel_range)
+    if pixels.shape[2] == 4:
+        opacity = pixels[..., 3:].astype(np.uint16)
+        pixels = ((pixels[..., :3] * opacity + 127) // 255).astype(np.uint8)
+    return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else np.ascontiguousarray(pixels)
 
 
 def guessed_range(image: NDArray[Any]) -> tuple[float, float] | None:

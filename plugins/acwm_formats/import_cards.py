@@ -19,7 +19,7 @@ from acwm_core.env.state_field import without_dangling
 from acwm_core.errors import DataError
 from acwm_formats.alignment import Alignment
 from acwm_formats.bounds import action_bounds, beyond, outliers
-from acwm_formats.reading import Bounds, ImportOptions, Reading, Scan
+from acwm_formats.reading import Bounds, CommonReading, ImportOptions, Scan
 from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.timeline import RecordedDataset
 
@@ -70,7 +70,7 @@ class Described:
 
     recorded: RecordedDataset
     options: ImportOptions
-    reading: Reading
+    reading: CommonReading
     cameras: tuple[str, ...]
 
     def command(self) -> dict[str, str]:
@@ -91,7 +91,7 @@ class Described:
         rate: ActionRate | None = None,
     ) -> DatasetCard:
         """The card of the dataset that holds the recordings `kept`, whose actions have a rate."""
-        present = [split for split in SPLITS if any(each.split == split for each in kept)]
+        present = [split for split in SPLITS if any(scan.split == split for scan in kept)]
         rows = {split: _rows([k for k in kept if k.split == split]) for split in present}
         basis = rows.get("train", np.zeros((0, 0), np.float32))
         action = self._action(basis if len(basis) else np.concatenate([*rows.values()]))
@@ -104,7 +104,7 @@ class Described:
             action,
             frame_size=(size[0], size[1] * len(self.reading.cameras)),
             fps=fps,
-            horizon=max(length for each in kept for length in each.lengths),
+            horizon=max(length for scan in kept for length in scan.lengths),
             state=self.reading.state,
             summary=self.recorded.summary,
             engine=self.recorded.engine,
@@ -140,7 +140,7 @@ class Described:
             if len(given[0]) not in (1, action.size):
                 wrong = f"{len(given[0])} dimensions, and the actions {action.size}"
                 raise DataError(f"--bounds has those of {wrong}: {', '.join(action.names)}")
-            low, high = (each * action.size if len(each) == 1 else each for each in given)
+            low, high = (bound * action.size if len(bound) == 1 else bound for bound in given)
             return replace(action, low=low, high=high)
         low, high = action_bounds(rows, quantile=self.options.bounds == "quantile")
         if self.recorded.actions.bounds is not None:
@@ -161,7 +161,7 @@ class Described:
             if not quantile and "train" in rows:
                 notes += outliers(rows["train"], action.names)
         for split, some in rows.items():
-            notes += [f"{split}: {told}" for told in (beyond(some, action) if len(some) else ())]
+            notes += [f"{split}: {note}" for note in (beyond(some, action) if len(some) else ())]
         if self.recorded.instances and not self.reading.instances:
             notes.append(
                 "Masks and contacts were omitted, because they belong to frames of another size."
@@ -169,14 +169,16 @@ class Described:
         if alignment.shift:
             unit = "frame" if abs(alignment.shift) == 1 else "frames"
             notes.append(f"Actions were moved by {alignment.shift} {unit}.")
-        told = _told([(each.name, note) for each in kept for note in each.notes])
-        told += [
-            f"{defect}: its usable parts were kept" for each in kept for defect in each.defects
+        of_recordings = _notes_by_recording(
+            [(scan.name, note) for scan in kept for note in scan.notes]
+        )
+        of_recordings += [
+            f"{defect}: its usable parts were kept" for scan in kept for defect in scan.defects
         ]
         others = [name for name in self.cameras if name not in self.reading.cameras]
         if others:
             notes.append(f"Frames of {self.reading.cameras[0]}; other cameras: {', '.join(others)}")
-        return [*notes, *few(told)]
+        return [*notes, *few(of_recordings)]
 
     def _words(self) -> dict[str, object]:
         """The options of the command that imports the same again."""
@@ -190,7 +192,7 @@ class Described:
             "test_episodes": asked.test_episodes,
             "bounds": None if asked.bounds == "range" else bounds_as_typed(asked.bounds),
             "depth_range": asked.depth_range
-            and ",".join(f"{each:g}" for each in asked.depth_range),
+            and ",".join(f"{limit:g}" for limit in asked.depth_range),
         }
         kinds = ",".join(alignment.kinds)
         known = ",".join(self.recorded.actions.kinds(self.reading.action.size))
@@ -205,16 +207,16 @@ def bounds_as_typed(bounds: Bounds) -> str:
     if not isinstance(bounds, tuple):
         return bounds
     pairs = zip(*bounds, strict=True)
-    return ",".join(f"{each!r}" for pair in pairs for each in pair)
+    return ",".join(f"{limit!r}" for pair in pairs for limit in pair)
 
 
 def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
     """Rows of the actions of some recordings ``[N, A]``."""
-    rows = [each.actions for each in kept if len(each.actions)]
+    rows = [scan.actions for scan in kept if len(scan.actions)]
     return np.concatenate(rows) if rows else np.zeros((0, 0), np.float32)
 
 
-def _told(notes: Sequence[tuple[str, str]]) -> list[str]:
+def _notes_by_recording(notes: Sequence[tuple[str, str]]) -> list[str]:
     """Notes with the names of their recordings; what is said of many is said once."""
     names: dict[str, list[str]] = {}
     for name, note in notes:
@@ -241,9 +243,9 @@ def import_command(kind: str, name: str, **options: object) -> str:
     """
     words = ["acwm", "data", "import", kind, name]
     for option, value in options.items():
-        for each in value if isinstance(value, list) else [value]:  # pyright: ignore
-            if each is None or each is False:
+        for entry in value if isinstance(value, list) else [value]:  # pyright: ignore
+            if entry is None or entry is False:
                 continue
-            size = "x".join(map(str, cast(Any, each))) if isinstance(each, tuple) else str(each)
-            words += [f"--{option.replace('_', '-')}", *([] if each is True else [size])]
+            size = "x".join(map(str, cast(Any, entry))) if isinstance(entry, tuple) else str(entry)
+            words += [f"--{option.replace('_', '-')}", *([] if entry is True else [size])]
     return shlex.join(words)

@@ -208,7 +208,7 @@ class _Cameras(Mapping[str, Frames]):
 
 
 @dataclass(frozen=True)
-class _Index:
+class _EpisodeIndex:
     """Where all episodes lie, read once per worker."""
 
     features: dict[str, dict[str, Any]]
@@ -218,13 +218,13 @@ class _Index:
     @functools.cached_property
     def _by_file(self) -> dict[tuple[str, Path], list[EpisodeFiles]]:
         """The episodes of each video, in their order there."""
-        found: dict[tuple[str, Path], list[EpisodeFiles]] = {}
+        by_file: dict[tuple[str, Path], list[EpisodeFiles]] = {}
         for place in self.places:
-            for camera, shown in place.videos.items():
-                found.setdefault((camera, shown.path), []).append(place)
-        for (camera, _), inside in found.items():
+            for camera, span in place.videos.items():
+                by_file.setdefault((camera, span.path), []).append(place)
+        for (camera, _), inside in by_file.items():
             inside.sort(key=lambda place: place.videos[camera].start)
-        return found
+        return by_file
 
     def video(self, index: int, camera: str) -> VideoFrames:
         """The frames of an episode in a video of one or many episodes.
@@ -253,12 +253,12 @@ class _Index:
 
 
 @functools.lru_cache(maxsize=2)
-def _index_of(root: Path, _: str) -> _Index:
+def _index_of(root: Path, _: str) -> _EpisodeIndex:
     info = read_info(root)
-    return _Index(info["features"], info["fps"], read_places(root))
+    return _EpisodeIndex(info["features"], info["fps"], read_places(root))
 
 
-def _index(root: Path) -> _Index:
+def _index(root: Path) -> _EpisodeIndex:
     meta = [root / INFO, *(root / "meta").glob("episodes*"), *(root / "meta").glob("episodes/*/*")]
     return _index_of(root, " ".join(map(file_stamp, meta)))
 
@@ -423,9 +423,9 @@ def _tests(info: Mapping[str, Any], places: Sequence[EpisodeFiles]) -> dict[Spli
     """The test episodes that the dataset names."""
     tests: dict[Split, list[int]] = {}
     for name, text in cast(dict[str, Any], info.get("splits") or {}).items():
-        found = re.fullmatch(r"(\d+):(\d+)", str(text))
-        if found and name in TESTS:
-            first, stop = int(found[1]), int(found[2])
+        match = re.fullmatch(r"(\d+):(\d+)", str(text))
+        if match and name in TESTS:
+            first, stop = int(match[1]), int(match[2])
             tests.setdefault(TESTS[name], []).extend(
                 index for index, place in enumerate(places) if first <= place.episode < stop
             )
@@ -435,7 +435,7 @@ def _tests(info: Mapping[str, Any], places: Sequence[EpisodeFiles]) -> dict[Spli
 def _facts(root: Path, places: Sequence[EpisodeFiles]) -> dict[str, Any]:
     """Facts that identify this dataset without reading all of it."""
     digest = hashlib.sha256((root / INFO).read_bytes())
-    starts = [[shown.start for shown in place.videos.values()] for place in places]
+    starts = [[span.start for span in place.videos.values()] for place in places]
     lengths = [(place.episode, place.length) for place in places]
     digest.update(repr((lengths, starts)).encode())
     return {"sha256_of_meta": digest.hexdigest()}

@@ -212,9 +212,9 @@ def _path(root: Path, template: str, names: Mapping[str, Any]) -> Path:
     gigabytes.
     """
 
-    def value(found: re.Match[str]) -> str:
-        given = names[found[1]]
-        return f"{given:0{found[2]}d}" if found[2] else str(given)
+    def value(match: re.Match[str]) -> str:
+        given = names[match[1]]
+        return f"{given:0{match[2]}d}" if match[2] else str(given)
 
     name = Path(re.sub(r"\{(\w+)(?::0(\d)d)?\}", value, template))
     if name.is_absolute() or ".." in name.parts:

@@ -20,7 +20,7 @@ EARLY = 5 * 10**6  # ns by which clocks differ that are one
 SAME = 10**6  # ns: a difference that does not matter
 
 
-class Clock(NamedTuple):
+class TopicClock(NamedTuple):
     """Times of the messages of one topic, in ns.
 
     Attributes:
@@ -48,7 +48,9 @@ class Clock(NamedTuple):
         return int(np.median(self.logged - self.stamps))
 
 
-def times_of(clocks: Mapping[str, Clock], wanted: Stamps | None) -> dict[str, NDArray[np.int64]]:
+def times_of(
+    clocks: Mapping[str, TopicClock], wanted: Stamps | None
+) -> dict[str, NDArray[np.int64]]:
     """The times of the messages of each topic, all on one clock, in ns.
 
     Args:
@@ -56,12 +58,14 @@ def times_of(clocks: Mapping[str, Clock], wanted: Stamps | None) -> dict[str, ND
         wanted: whose times to take; by default those of headers, where they can be compared.
     """
     stamped = _stamped(clocks, wanted)
-    return {name: each.stamps if name in stamped else each.logged for name, each in clocks.items()}
+    return {
+        name: clock.stamps if name in stamped else clock.logged for name, clock in clocks.items()
+    }
 
 
-def _stamped(clocks: Mapping[str, Clock], wanted: Stamps | None) -> set[str]:
+def _stamped(clocks: Mapping[str, TopicClock], wanted: Stamps | None) -> set[str]:
     """The topics whose headers count."""
-    have = {name for name, each in clocks.items() if each.is_stamped}
+    have = {name for name, clock in clocks.items() if clock.is_stamped}
     near = {name for name in have if -EARLY <= clocks[name].late <= LATEST}
     if wanted == "log":
         return set()
@@ -70,9 +74,9 @@ def _stamped(clocks: Mapping[str, Clock], wanted: Stamps | None) -> set[str]:
     return have if wanted == "header" or (own and near != have) else near
 
 
-def clock_note(clocks: Mapping[str, Clock], wanted: Stamps | None) -> str:
+def clock_note(clocks: Mapping[str, TopicClock], wanted: Stamps | None) -> str:
     """Which times were taken, for people."""
-    stamped, have = _stamped(clocks, wanted), {n for n, each in clocks.items() if each.is_stamped}
+    stamped, have = _stamped(clocks, wanted), {n for n, clock in clocks.items() if clock.is_stamped}
     late = [
         f"{name} {clocks[name].late / 1e9:.3g} s before it was logged"
         for name in clocks
@@ -86,6 +90,6 @@ def clock_note(clocks: Mapping[str, Clock], wanted: Stamps | None) -> str:
     if left := sorted(have - stamped):
         why = "as asked" if wanted == "log" else "as others have none of the same clock"
         return f"times are those of the log, and not of the headers of {', '.join(left)}, {why}"
-    back = sorted(name for name, each in clocks.items() if each.goes_back)
+    back = sorted(name for name, clock in clocks.items() if clock.goes_back)
     why = f"; stamps go back in the headers of {', '.join(back)}" if back else ""
     return f"times are those of the log{why}"

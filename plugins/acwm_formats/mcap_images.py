@@ -149,7 +149,7 @@ class LoggedVideo(_Logged):
         return DataError(f"the video {self._topic} of {self._path}: {what}")
 
 
-class Camera:
+class CameraMessages:
     """Gathers the times of a topic's frames, and makes them readable."""
 
     def __init__(self, topic: str) -> None:

@@ -20,9 +20,9 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
-from acwm_formats.mcap_clocks import Clock, Stamps, clock_note, times_of
-from acwm_formats.mcap_images import Camera, is_image, is_video
-from acwm_formats.mcap_messages import Column, Numbers, entries, topics
+from acwm_formats.mcap_clocks import Stamps, TopicClock, clock_note, times_of
+from acwm_formats.mcap_images import CameraMessages, is_image, is_video
+from acwm_formats.mcap_messages import NumberMessages, Numbers, entries, topics
 from acwm_formats.names import unread_note, word, words
 from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.timeline import (
@@ -96,13 +96,13 @@ class MCAP(Format):
         cameras = words(video) or tuple(filmed)
         if not cameras:
             raise DataError(f"{first} has no topic of images or video, only {_told(kinds)}")
-        asked = [each.partition(":")[0] for each in words(states)] + [
+        asked = [state.partition(":")[0] for state in words(states)] + [
             (actions or "").partition(":")[0]
         ]
         for topic in (*cameras, *filter(None, asked)):
             if topic not in kinds:
                 raise DataError(f"{first} has no topic {topic!r}{suggest(topic, kinds)}")
-        wanted, found = _actions(first, actions, [t for t in kinds if t not in filmed])
+        wanted, numbers = _actions(first, actions, [t for t in kinds if t not in filmed])
         log = Log(cameras, wanted, words(states), stamps)
         used = {*cameras, wanted.partition(":")[0], *asked}
         return RecordedDataset(
@@ -112,7 +112,7 @@ class MCAP(Format):
             | {"bytes": sum(path.stat().st_size for path in files)},
             options={"video": video, "actions": actions, "states": states, "stamps": stamps}
             | {"follow_links": follow_links},
-            actions=ActionFacts(found.names),
+            actions=ActionFacts(numbers.names),
             notes=_notes(first, log, [topic for topic in kinds if topic not in used])
             + tuple(unread_note(root, files)),
             summary=f"Logs of {root.resolve().name}",
@@ -149,9 +149,11 @@ class Logs:
 
     def _opened(self, path: Path, log: Log) -> TimedRecording:
         cameras, columns = _read(path, log)
-        numbers = {name: each.numbers() for name, each in columns.items()}
+        numbers = {name: column.numbers() for name, column in columns.items()}
         times = times_of(_clocks(cameras, numbers), log.stamps)
-        zero = min((int(times[each.topic][0]) for each in cameras if len(each.times)), default=0)
+        zero = min(
+            (int(times[camera.topic][0]) for camera in cameras if len(camera.times)), default=0
+        )
 
         def samples(name: str) -> Samples:
             return Samples(numbers[name].rows, (times[name] - zero) / 1e9)
@@ -165,17 +167,19 @@ class Logs:
         )
 
 
-def _read(path: Path, log: Log) -> tuple[list[Camera], dict[str, Column]]:
+def _read(path: Path, log: Log) -> tuple[list[CameraMessages], dict[str, NumberMessages]]:
     """What a file holds of the topics that are asked for."""
-    cameras = [Camera(topic) for topic in log.cameras]
-    columns = {name: Column(name) for name in (log.actions, *log.states)}
+    cameras = [CameraMessages(topic) for topic in log.cameras]
+    columns = {name: NumberMessages(name) for name in (log.actions, *log.states)}
     _gathered(path, cameras, columns)
     return cameras, columns
 
 
-def _clocks(cameras: Sequence[Camera], numbers: Mapping[str, Numbers]) -> dict[str, Clock]:
-    clocks = {each.topic: Clock(each.times, each.stamps) for each in cameras}
-    return clocks | {name: Clock(each.times, each.stamps) for name, each in numbers.items()}
+def _clocks(
+    cameras: Sequence[CameraMessages], numbers: Mapping[str, Numbers]
+) -> dict[str, TopicClock]:
+    clocks = {camera.topic: TopicClock(camera.times, camera.stamps) for camera in cameras}
+    return clocks | {name: TopicClock(topic.times, topic.stamps) for name, topic in numbers.items()}
 
 
 def _notes(path: Path, log: Log, others: Sequence[str]) -> tuple[str, ...]:
@@ -183,25 +187,27 @@ def _notes(path: Path, log: Log, others: Sequence[str]) -> tuple[str, ...]:
     cameras, columns = _read(path, log)
     known: dict[str, Numbers] = {}
     with contextlib.suppress(DataError):  # opening it will tell
-        known = {name: each.numbers() for name, each in columns.items()}
-    told = clock_note(_clocks(cameras, known), log.stamps)
-    notes = [f"Actions are {log.actions}; {told}."]
+        known = {name: column.numbers() for name, column in columns.items()}
+    note = clock_note(_clocks(cameras, known), log.stamps)
+    notes = [f"Actions are {log.actions}; {note}."]
     if others:
         notes.append(f"Topics that were left out: {', '.join(others)}.")
     return tuple(notes)
 
 
-def _gathered(path: Path, cameras: Sequence[Camera], columns: Mapping[str, Column]) -> None:
+def _gathered(
+    path: Path, cameras: Sequence[CameraMessages], columns: Mapping[str, NumberMessages]
+) -> None:
     """Give each message of the file to those who gather its topic, in one scan."""
-    by_topic: dict[str, list[Camera | Column]] = {}
-    for each in (*cameras, *columns.values()):
-        by_topic.setdefault(each.topic, []).append(each)
+    by_topic: dict[str, list[CameraMessages | NumberMessages]] = {}
+    for gatherer in (*cameras, *columns.values()):
+        by_topic.setdefault(gatherer.topic, []).append(gatherer)
     for entry in entries(path, list(by_topic)):
-        for each in by_topic[entry.topic]:
-            each.add(entry)
+        for gatherer in by_topic[entry.topic]:
+            gatherer.add(entry)
 
 
-def _frames(path: Path, camera: Camera, times: NDArray[np.float64]) -> ImageFrames:
+def _frames(path: Path, camera: CameraMessages, times: NDArray[np.float64]) -> ImageFrames:
     stamp = f"{camera.topic} {file_stamp(path)}"
     return ImageFrames(camera.images(path), times, channels="rgb", stamp=stamp)
 
@@ -220,16 +226,17 @@ def _files(path: Path) -> list[Path]:
 
 def _actions(path: Path, wanted: str | None, others: Sequence[str]) -> tuple[str, Numbers]:
     """The topic of actions, which is wanted or the only one with numbers, and its numbers."""
-    columns = {name: Column(name) for name in ([wanted] if wanted else others)}
+    columns = {name: NumberMessages(name) for name in ([wanted] if wanted else others)}
     _gathered(path, (), columns)
     if wanted:
         return wanted, columns[wanted].numbers()
-    found = [name for name, each in columns.items() if each.rows and each.problem is None]
-    if len(found) != 1:
+    topics = [name for name, column in columns.items() if column.rows and column.problem is None]
+    if len(topics) != 1:
         raise DataError(
-            f"{path} has {len(found)} topics of numbers ({', '.join(found)}): give --actions TOPIC"
+            f"{path} has {len(topics)} topics of numbers ({', '.join(topics)}): "
+            "give --actions TOPIC"
         )
-    return found[0], columns[found[0]].numbers()
+    return topics[0], columns[topics[0]].numbers()
 
 
 def _told(kinds: dict[str, str]) -> str:

@@ -87,8 +87,8 @@ def topics(path: Path) -> dict[str, str]:
     with _opened(path) as reader:
         summary = reader.get_summary()
         if summary is None or not summary.channels:
-            found = reader.iter_messages()
-            return {channel.topic: schema.name if schema else "" for schema, channel, _ in found}
+            messages = reader.iter_messages()
+            return {channel.topic: schema.name if schema else "" for schema, channel, _ in messages}
         schemas = summary.schemas
         return {
             channel.topic: schemas[channel.schema_id].name if channel.schema_id else ""
@@ -107,8 +107,9 @@ def entries(path: Path, wanted: Sequence[str]) -> Iterator[LoggedMessage]:
     with _opened(path) as reader:
         for schema, channel, message in reader.iter_messages(topics=list(wanted)):
             if channel.id not in decoders:
-                made = (each.decoder_for(channel.message_encoding, schema) for each in factories)
-                decoders[channel.id] = next((each for each in made if each), None)
+                encoding = channel.message_encoding
+                fitting = (factory.decoder_for(encoding, schema) for factory in factories)
+                decoders[channel.id] = next(filter(None, fitting), None)
             decode = _decoding(path, channel, decoders[channel.id], message.data)
             yield LoggedMessage(
                 channel.topic, schema.name if schema else "", message.log_time, decode
@@ -170,7 +171,7 @@ def _opened(path: Path) -> Generator[Any]:
 
 
 @dataclass
-class Column:
+class NumberMessages:
     """Gathers the numbers of a topic, or of one field of it: ``TOPIC`` or ``TOPIC:FIELD``."""
 
     name: str
@@ -195,20 +196,20 @@ class Column:
 
     def _add(self, entry: LoggedMessage) -> None:
         content, asked = entry.content(), self.name.partition(":")[2]
-        found = dict(_leaves(content))
+        leaves = dict(_leaves(content))
         if asked:
-            found = {n: v for n, v in found.items() if re.split(r"[.\[]", n)[0] == asked}
-        if not found:
+            leaves = {n: v for n, v in leaves.items() if re.split(r"[.\[]", n)[0] == asked}
+        if not leaves:
             raise DataError(f"message {len(self.rows)} of {self.name} holds no numbers")
-        self.names = self.names or tuple(found)
-        if tuple(found) != self.names:
+        self.names = self.names or tuple(leaves)
+        if tuple(leaves) != self.names:
             raise DataError(
-                f"message {len(self.rows)} of {self.name} holds {len(found)} numbers, but "
+                f"message {len(self.rows)} of {self.name} holds {len(leaves)} numbers, but "
                 f"the first {len(self.names)}"
             )
         self.times.append(entry.time)
         self.stamps.append(stamp_of(content))
-        self.rows.append(list(found.values()))
+        self.rows.append(list(leaves.values()))
 
     def numbers(self) -> Numbers:
         """What was gathered.
@@ -230,8 +231,8 @@ def stamp_of(message: Any) -> int:
     for place in (header, message):
         for name in ("stamp", "timestamp"):
             time = content_of(place, name) if place is not None else None
-            if (found := _nanoseconds(time)) is not None:
-                return found
+            if (stamp := _nanoseconds(time)) is not None:
+                return stamp
     return 0
 
 
@@ -253,9 +254,9 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
     elif isinstance(value, str | bytes) or value is None:
         return
     elif (fields := _fields(value)) is not None:
-        for each in fields:
-            if each not in UNNUMBERED:
-                yield from _leaves(content_of(value, each), f"{name}.{each}".lstrip("."))
+        for key in fields:
+            if key not in UNNUMBERED:
+                yield from _leaves(content_of(value, key), f"{name}.{key}".lstrip("."))
     else:
         for place, entry in enumerate(value):
             yield from _leaves(entry, f"{name}[{place}]")

@@ -178,12 +178,12 @@ class MinariRecordings:
 
 def _texts(seen: Mapping[str, Any]) -> dict[str, Any]:
     """Observed texts: one, or those that follow each other."""
-    found: dict[str, Any] = {}
+    facts: dict[str, Any] = {}
     for name, values in seen.items():
         if isinstance(values, list) and all(isinstance(text, str) for text in values):
             texts = list(dict.fromkeys(values))
-            found[name] = texts[0] if len(texts) == 1 else texts
-    return found
+            facts[name] = texts[0] if len(texts) == 1 else texts
+    return facts
 
 
 def _notes(recordings: MinariRecordings, others: Sequence[str]) -> tuple[str, ...]:

@@ -61,8 +61,8 @@ def check_mp4(path: Path) -> None:
             samples = claimed if box.kind == b"stsz" else samples
             if edits > MOST_EDITS:
                 raise DataError(f"{path} has {edits:,} edits: write it again without an edit list")
-            shown = edits * samples if edits * samples > MOST_SHOWN else 0
-            if (most := max(claimed, in_fragments, shown)) > size:
+            frames_of_edits = edits * samples if edits * samples > MOST_SHOWN else 0
+            if (most := max(claimed, in_fragments, frames_of_edits)) > size:
                 raise DataError(f"{path} claims {most:,} frames, and has {size:,} bytes")
 
 

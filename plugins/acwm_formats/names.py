@@ -55,8 +55,8 @@ def unread_note(root: Path, used: Iterable[Path]) -> list[str]:
     others = sorted(
         path.name for path in {*root.iterdir()} - {*used} if not path.name.startswith((".", "_"))
     )
-    told = f"{', '.join(others[:5])}{' …' * (len(others) > 5)}"
-    return [f"Files that were not read: {told}."] if others else []
+    names = f"{', '.join(others[:5])}{' …' * (len(others) > 5)}"
+    return [f"Files that were not read: {names}."] if others else []
 
 
 def words(text: str | None) -> tuple[str, ...]:

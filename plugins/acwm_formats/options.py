@@ -67,8 +67,8 @@ def _kinds(_: click.Context, __: click.Parameter, value: str | None) -> tuple[st
 
 
 def _option(words: list[str], text: str, **settings: Any) -> click.Option:
-    shown = settings.get("default") is not None
-    return click.Option(words, help=text, show_default=shown, **settings)
+    has_default = settings.get("default") is not None
+    return click.Option(words, help=text, show_default=has_default, **settings)
 
 
 OPTIONS = (

@@ -72,14 +72,14 @@ class Published(Format):
         root = Path(root)
         if _splits(root):
             return _dataset(root, follow_links)
-        found: dict[str, RecordedDataset] = {}
+        datasets: dict[str, RecordedDataset] = {}
         for folder in _folders(root):
             dataset = _dataset(folder, follow_links)
             name = dataset.name
-            if name in found:
+            if name in datasets:
                 raise DataError(f"{folder} is a second {name}: import one folder at a time")
-            found[name] = dataset
-        return found
+            datasets[name] = dataset
+        return datasets
 
     def write(self, export: Export) -> None:
         """Write the layout of the published ACWM-Phys release.
@@ -219,7 +219,7 @@ class _Meaning(NamedTuple):
 
 def _meaning(name: str, entries: Mapping[Split, list[EpisodeMetadata]]) -> _Meaning:
     """Take the description from the registered environment if the sizes of its actions match."""
-    sizes = Counter(entry.actions.shape[1] for each in entries.values() for entry in each)
+    sizes = Counter(entry.actions.shape[1] for part in entries.values() for entry in part)
     size = sizes.most_common(1)[0][0]  # others are defects of their episodes
     known = next((card for card in _registered(name) if card.action.size == size), None)
     notes = ["Actions are as published, normalised to [-1, 1]: units are lost."]
@@ -247,7 +247,9 @@ def _meaning(name: str, entries: Mapping[Split, list[EpisodeMetadata]]) -> _Mean
 def _registered(name: str) -> list[EnvironmentCard]:
     """The cards of an environment and its variants, if they are installed."""
     cards = _card(name)
-    return cards + [card for found in cards for other in found.variants for card in _card(other)]
+    return cards + [
+        variant for card in cards for other in card.variants for variant in _card(other)
+    ]
 
 
 def _card(name: str) -> list[EnvironmentCard]:

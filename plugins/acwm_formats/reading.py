@@ -62,12 +62,12 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
-class Reading:
+class CommonReading:
     """What the recordings of a dataset have in common.
 
     Attributes:
         cameras: those to show, from left to right.
-        found: size of the frames of the first camera.
+        recorded_size: size of the frames of the first camera.
         size: frame size of every camera in the dataset.
         resized: whether the size was asked for, so that frames of other sizes become it too.
         depth_range: as in `ImportOptions`.
@@ -80,7 +80,7 @@ class Reading:
     """
 
     cameras: tuple[str, ...]
-    found: tuple[int, int]
+    recorded_size: tuple[int, int]
     size: tuple[int, int]
     resized: bool
     depth_range: tuple[float, float] | None
@@ -109,32 +109,33 @@ class Reading:
         return aligned
 
     def _state_names(self, recording: TimedRecording) -> list[str]:
-        return [each.name for each in self.state if each.name in recording.states]
+        return [field.name for field in self.state if field.name in recording.states]
 
     def _check_size(self, aligned: Aligned, size: tuple[int, int]) -> None:
-        if size == self.found:
+        if size == self.recorded_size:
             return
         if not self.resized:
-            shapes = f"{size[0]}×{size[1]}, and those of the first {self.found[0]}×{self.found[1]}"
-            aligned.found(f"its frames are {shapes}", "--size")
+            first = "×".join(map(str, self.recorded_size))
+            shapes = f"{size[0]}×{size[1]}, and those of the first {first}"
+            aligned.add_defect(f"its frames are {shapes}", "--size")
         elif size[0] < self.size[0] or size[1] < self.size[1]:
-            aligned.found(f"its frames of {size[0]}×{size[1]} cannot be enlarged", "--size")
+            aligned.add_defect(f"its frames of {size[0]}×{size[1]} cannot be enlarged", "--size")
             aligned.episodes.clear()
 
     def _check_numbers(self, aligned: Aligned, episode: PlannedEpisode) -> None:
-        found, wanted = episode.actions.shape[1], self.action.size
-        if found != wanted:
-            aligned.found(f"its actions have {found} dimensions, not {wanted}", "")
+        size = episode.actions.shape[1]
+        if size != self.action.size:
+            aligned.add_defect(f"its actions have {size} dimensions, not {self.action.size}", "")
             aligned.episodes.clear()
             return
         if self.stated and (beyond := out_of_bounds(episode.actions[:-1], self.action)):
-            aligned.found(beyond, "")
+            aligned.add_defect(beyond, "")
             aligned.episodes.clear()
             return
-        for each in self.state:
-            shape = episode.states[each.name].shape[1:] if each.name in episode.states else None
-            if shape != each.shape:
-                aligned.found(f"the state {each.name} is {shape}, not {each.shape}", "")
+        for wanted in self.state:
+            shape = episode.states[wanted.name].shape[1:] if wanted.name in episode.states else None
+            if shape != wanted.shape:
+                aligned.add_defect(f"the state {wanted.name} is {shape}, not {wanted.shape}", "")
                 aligned.episodes.clear()
                 return
 
@@ -169,8 +170,8 @@ def opened(recordings: Recordings, index: int, name: str, fps: float | None) -> 
         DataError: it cannot be read.
     """
     try:
-        found = recordings[index]
-        return found.timed(name, fps) if isinstance(found, Recording) else found
+        recording = recordings[index]
+        return recording.timed(name, fps) if isinstance(recording, Recording) else recording
     except (AcwmError, OSError) as error:
         raise DataError(str(error)) from error
 
@@ -182,7 +183,7 @@ class ScanTask:
     recordings: Recordings
     split: Split
     indices: tuple[int, ...]
-    reading: Reading
+    reading: CommonReading
     sampled: int  # most rows of actions to return of each
 
 
@@ -200,7 +201,7 @@ class Scan:
         seconds: how long it is.
         per_frame, unused: actions per frame, and the share at no frame, as in `Aligned`.
         actions: rows of its actions ``[N, A]``: evenly chosen ones, and the least and the greatest.
-        keys: what identifies each episode, see `Reading.key`.
+        keys: what identifies each episode, see `CommonReading.key`.
     """
 
     split: Split
@@ -224,19 +225,19 @@ class Scan:
 
 def scan(task: ScanTask, report: Report) -> list[Scan]:
     """Look at the times and numbers of recordings; reports each."""
-    made: list[Scan] = []
+    scans: list[Scan] = []
     for index in task.indices:
         name = episode_name(task.split, index)
         try:
             recording = opened(task.recordings, index, name, task.reading.fps)
             aligned = task.reading.planned(recording)
         except DataError as error:
-            made.append(Scan.of_defect(task.split, index, name, str(error)))
+            scans.append(Scan.of_defect(task.split, index, name, str(error)))
         else:
-            keys = tuple(task.reading.key(recording, each) for each in aligned.episodes)
-            made.append(scanned(task.split, index, aligned, task.sampled, keys))
+            keys = tuple(task.reading.key(recording, episode) for episode in aligned.episodes)
+            scans.append(scanned(task.split, index, aligned, task.sampled, keys))
         report(1)
-    return made
+    return scans
 
 
 def scanned(
@@ -274,7 +275,7 @@ def episode_name(split: str, index: int) -> str:
 
 def common_reading(
     recorded: RecordedDataset, first: TimedRecording, options: ImportOptions
-) -> Reading:
+) -> CommonReading:
     """What the recordings have in common, told by the first one.
 
     Raises:
@@ -282,18 +283,18 @@ def common_reading(
         ShapeError: the size is not possible.
     """
     cameras = _cameras(first, options)
-    found = first.cameras[cameras[0]].size
-    size = target_size(found, options.size or recorded.size)
+    recorded_size = first.cameras[cameras[0]].size
+    size = target_size(recorded_size, options.size or recorded.size)
     states = recorded.state
     if states is None:
         shapes = {name: np.shape(rows.values)[1:] for name, rows in first.states.items()}
         states = tuple(StateField(n, shape, "", "as recorded") for n, shape in shapes.items())
-    elif missing := [each.name for each in states if each.name not in first.states]:
+    elif missing := [field.name for field in states if field.name not in first.states]:
         hint = suggest(missing[0], first.states)
         raise DataError(f"recordings have no state {missing[0]!r}{hint}")
-    return Reading(
+    return CommonReading(
         cameras,
-        found,
+        recorded_size,
         size,
         bool(options.size or recorded.size),
         options.depth_range,
@@ -304,7 +305,7 @@ def common_reading(
         not isinstance(options.bounds, tuple)
         and recorded.actions.bounds is not None
         and not recorded.actions.widened,
-        recorded.instances if size == found and len(cameras) == 1 else (),
+        recorded.instances if size == recorded_size and len(cameras) == 1 else (),
     )
 
 

@@ -26,8 +26,8 @@ from acwm_formats.alignment import Defect
 from acwm_formats.cadence import QUARTER, SAME, common_rate
 from acwm_formats.import_cards import Described, few
 from acwm_formats.reading import (
+    CommonReading,
     ImportOptions,
-    Reading,
     Scan,
     ScanTask,
     common_reading,
@@ -114,7 +114,7 @@ class _Import:
     options: ImportOptions
     parts: Parts
     first: TimedRecording
-    reading: Reading
+    reading: CommonReading
     executor: LocalExecutor
     progress: bool
 
@@ -187,8 +187,8 @@ class _Import:
             for start in range(0, len(places), AT_ONCE)
         ]
         executor = self.executor if total > AT_ONCE else LocalExecutor(0)  # workers start slowly
-        shown = self.progress and total > AT_ONCE
-        with progress_bar("looking", total, shown=shown) as report:
+        is_slow = self.progress and total > AT_ONCE
+        with progress_bar("looking", total, shown=is_slow) as report:
             scans = [*itertools.chain.from_iterable(executor.run(scan, tasks, report))]
         return sorted(scans, key=lambda scan: (SPLITS.index(scan.split), scan.index))
 

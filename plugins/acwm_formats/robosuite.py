@@ -77,8 +77,8 @@ def _size(part: Mapping[str, Any]) -> int:
 def _parts(given: Any) -> Iterator[Mapping[str, Any]]:
     """The controllers of all arms, in any version: one, a list, or the parts of a body."""
     if isinstance(given, list):
-        for each in cast(list[Any], given):
-            yield from _parts(each)
+        for part in cast(list[Any], given):
+            yield from _parts(part)
     elif isinstance(given, dict):
         config = cast(dict[str, Any], given)
         bodies = config.get("body_parts", config.get("body_parts_controller_configs"))

@@ -110,8 +110,8 @@ def rollouts(
         raise RecipeError(f"--frames {frames}: give at least 2, with an action between them")
     stage = _stage(env)
     _policy(policy)  # which must be there
-    recordings: dict[Split, Rollouts] = {
-        split: Rollouts(env, policy, EpisodeSpec(name, split, seed=seed), frames, count)
+    recordings: dict[Split, RolloutRecordings] = {
+        split: RolloutRecordings(env, policy, EpisodeSpec(name, split, seed=seed), frames, count)
         for split, count in counts.items()
         if count
     }
@@ -150,7 +150,7 @@ def _name(env_id: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)  # what was played last is remembered by identity
-class Rollouts:
+class RolloutRecordings:
     """The rollouts of one split; `spec` is the one of episode 0."""
 
     env: Env | Vector | Named
@@ -184,7 +184,7 @@ class Rollouts:
 
 
 @functools.lru_cache(maxsize=1)
-def _played(rollouts: Rollouts, batch: int) -> Sequence[Take]:
+def _played(rollouts: RolloutRecordings, batch: int) -> Sequence[Take]:
     """Rollouts that are played at once."""
     stage, spec = _stage(rollouts.env), rollouts.spec
     numbers = range(batch * stage.count, (batch + 1) * stage.count)

@@ -183,30 +183,30 @@ def _unwritable(folder: Path, error: OSError) -> DataError:
 def _listed(url: str) -> Marks:
     system, root = remote.located(url)
     try:
-        found = _found(system, root, url.startswith("http"))
+        files = _found(system, root, url.startswith("http"))
     except FileNotFoundError:
-        found = {}
+        files = {}
     except Exception as error:  # every protocol has its own exceptions
         if isinstance(error, OSError) and error.errno in OF_THE_DISK:
             raise
         raise DataError(f"cannot list {url}: {type(error).__name__}: {error}") from error
-    if not found:
+    if not files:
         raise DataError(f"there is nothing behind {url}")
     base = root.rstrip("/")
-    return {name.removeprefix(base).lstrip("/"): _marks(facts) for name, facts in found.items()}
+    return {name.removeprefix(base).lstrip("/"): _marks(facts) for name, facts in files.items()}
 
 
 def _found(system: Any, root: str, is_web: bool) -> dict[str, Any]:
     """What the file system tells of each file."""
     if is_web and system.info(root).get("mimetype") != "text/html":
         return {root: system.info(root)}
-    found = system.find(root, detail=True)
-    if not found and system.isfile(root):
-        found = {root: system.info(root)}
+    files = system.find(root, detail=True)
+    if not files and system.isfile(root):
+        files = {root: system.info(root)}
     if is_web:  # its pages name files, and nothing that tells a changed one
         with ThreadPoolExecutor(AT_ONCE) as pool:
-            found = dict(zip(found, pool.map(system.info, found), strict=True))
-    return found
+            files = dict(zip(files, pool.map(system.info, files), strict=True))
+    return files
 
 
 def _marks(facts: Mapping[str, Any]) -> list[str]:
@@ -224,8 +224,8 @@ def _fetch_all(url: str, missing: dict[str, Path], progress: bool) -> None:
             for rest, path in missing.items()
         ]
         try:
-            shown = Console(stderr=True)
-            for call in track(calls, f"fetching {url}", console=shown, disable=not progress):
+            console = Console(stderr=True)
+            for call in track(calls, f"fetching {url}", console=console, disable=not progress):
                 call.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)

@@ -29,7 +29,7 @@ from acwm_core.executors import Report
 from acwm_core.files import disk_error, writing, written_whole
 from acwm_formats.alignment import PlannedEpisode
 from acwm_formats.frames import file_stamp
-from acwm_formats.reading import Reading, Scan, episode_name, opened, scanned
+from acwm_formats.reading import CommonReading, Scan, episode_name, opened, scanned
 from acwm_formats.timeline import Recordings, TimedRecording
 
 STAGING = ".importing"
@@ -46,7 +46,7 @@ class StageTask:
     recordings: Recordings
     split: Split
     indices: tuple[int, ...]
-    reading: Reading
+    reading: CommonReading
     fps: float
     versions: Mapping[str, str]
     folder: Path
@@ -66,11 +66,11 @@ def stage(task: StageTask, report: Report) -> list[Staged]:
     Raises:
         DataError: the folder cannot be written.
     """
-    made: list[Staged] = []
+    staged: list[Staged] = []
     for index in task.indices:
-        made.append(_recording(task, index))
+        staged.append(_recording(task, index))
         report(1)
-    return made
+    return staged
 
 
 def _recording(task: StageTask, index: int) -> Staged:
@@ -86,8 +86,8 @@ def _recording(task: StageTask, index: int) -> Staged:
         full = disk_error(error)
         if full and full.filename and Path(full.filename).parent == task.folder:
             raise  # it is no defect of this recording
-        found = Scan.of_defect(task.split, index, name, str(error))
-        return Staged(found, ())
+        scan = Scan.of_defect(task.split, index, name, str(error))
+        return Staged(scan, ())
     return Staged(scanned(task.split, index, aligned, task.sampled, ()), tuple(files))
 
 
@@ -105,9 +105,9 @@ def _staged(task: StageTask, recording: TimedRecording, episode: PlannedEpisode)
     size = (reading.size[0], reading.size[1] * len(reading.cameras))
     masks, contacts = _no_masks(count, size, task.fps), np.zeros((0, 3), np.int32)
     if labels:
-        shown = episode.frames[reading.cameras[0]]
-        contacts = labels.contacts_of(shown)
-        masks = encode_frames(labels.masks_of(shown, size), size, MASK, task.fps, count)
+        places = episode.frames[reading.cameras[0]]
+        contacts = labels.contacts_of(places)
+        masks = encode_frames(labels.masks_of(places, size), size, MASK, task.fps, count)
     members = {
         "video.mkv": encode_frames(frames, size, VIDEO, task.fps, KEYFRAMES),
         "mask.mkv": masks,

@@ -274,9 +274,9 @@ def _check_head(head: bytes) -> None:
     cells = [cell.strip().strip("\"'") for cell in cells]
     whole = all(map(_is_number, filter(None, cells))) and any(cells)
     if whole or any(re.fullmatch(r"-?\d*\.\d+(e-?\d+)?", cell) for cell in cells):
-        shown = ", ".join(cells[:4])
+        first_cells = ", ".join(cells[:4])
         raise ValueError(
-            f"its first line holds numbers ({shown}): write the names of the columns above it"
+            f"its first line holds numbers ({first_cells}): write the names of the columns above it"
         )
 
 
@@ -286,8 +286,10 @@ def _check_names(columns: Mapping[str, NDArray[Any]]) -> None:
     words = [name for name in columns if name and name not in numbers]
     above_text = not any(holds_numbers(columns[name]) for name in words)
     if numbers and words and above_text and all(holds_numbers(columns[n]) for n in numbers):
-        shown = ", ".join([*columns][:4])
-        raise ValueError(f"its first line is a row ({shown}): write the names of the columns above")
+        first_names = ", ".join([*columns][:4])
+        raise ValueError(
+            f"its first line is a row ({first_names}): write the names of the columns above"
+        )
 
 
 def _parquet(path: Path) -> dict[str, Any]:
@@ -368,17 +370,17 @@ def parquet_file(path: Path) -> Any:
 def _columns(table: Any) -> dict[str, Any]:
     """The columns of an Arrow table; an empty field is NaN among numbers."""
     types = arrow.types
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
-        if name in found:
+        if name in arrays:
             raise ValueError(f"it has two columns called {name or 'nothing'}: name them apart")
         if types.is_nested(column.type):
-            found[name] = np.array(column.to_pylist())
+            arrays[name] = np.array(column.to_pylist())
         elif types.is_temporal(column.type):
             raise ValueError(f"the column {name} holds dates, not numbers: write times in seconds")
         else:
-            found[name] = column.to_numpy()
-    return found
+            arrays[name] = column.to_numpy()
+    return arrays
 
 
 def _npy(path: Path) -> dict[str, Any]:
@@ -399,9 +401,9 @@ def _jsonl(path: Path) -> dict[str, Any]:
 
 
 def _parsed(data: bytes) -> Any:
-    found = parse_json(data)  # which keeps the last of two entries of one name
+    content = parse_json(data)  # which keeps the last of two entries of one name
     json.loads(data, object_pairs_hook=_unlike)
-    return found
+    return content
 
 
 def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -235,8 +235,8 @@ class VideoFolder:
             )
         if self.table and place.rows:
             start, stop, count = place.rows
-            if (found := len(next(iter(rows.values())))) != count:
-                raise DataError(f"{path} has {found} rows, but its episodes have {count} pictures")
+            if (own := len(next(iter(rows.values())))) != count:
+                raise DataError(f"{path} has {own} rows, but its episodes have {count} pictures")
             rows = {name: values[start:stop] for name, values in rows.items()}
         return rows, path
 
@@ -254,18 +254,18 @@ class VideoFolder:
         return ImageFrames(paths, times, stamp=stamp)
 
     def _same_clock(
-        self, times: NDArray[np.float64] | None, shown: NDArray[np.float64], path: Path
+        self, times: NDArray[np.float64] | None, frame_times: NDArray[np.float64], path: Path
     ) -> NDArray[np.float64] | None:
         """The times of rows on the clock of the video."""
-        if times is None or not len(shown):
+        if times is None or not len(frame_times):
             return times
         if self.from_first_row:
-            return times - times[0] + shown[0]
-        if times[0] > shown[-1] or times[-1] < shown[0]:
+            return times - times[0] + frame_times[0]
+        if times[0] > frame_times[-1] or times[-1] < frame_times[0]:
             raise DataError(
                 f"the times of {path} ({times[0]:g} to {times[-1]:g} s) are not those of the video "
-                f"({shown[0]:g} to {shown[-1]:g} s): give --from-first-row if the first row was "
-                "taken with the first frame"
+                f"({frame_times[0]:g} to {frame_times[-1]:g} s): give --from-first-row if the "
+                "first row was taken with the first frame"
             )
         return times
 
@@ -285,16 +285,16 @@ def find_places(root: Path, actions: str | None = None) -> list[VideoEpisode]:
     Raises:
         DataError: several tables have the name of a video, but for the case of letters.
     """
-    found: list[VideoEpisode] = []
+    episodes: list[VideoEpisode] = []
     beside = _Tables(files_in(root, READERS))
     for path in files_in(root, [""]):
         if path.name.startswith("_"):
             continue
         if path.suffix.lower() in VIDEOS and path.is_file():
-            found.append(_tabled(path.stem, {"video": path}, beside.of(path.stem)))
+            episodes.append(_tabled(path.stem, {"video": path}, beside.of(path.stem)))
         elif path.is_dir():
-            found += _folder(path, actions, beside)
-    return found or _grouped(root, None)
+            episodes += _folder(path, actions, beside)
+    return episodes or _grouped(root, None)
 
 
 class _Tables:
@@ -486,7 +486,7 @@ def _notes(
     if lone := [table.name for table in files_in(root, READERS) if table not in used]:
         notes.append(f"Tables without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")
     if chosen.episode and (names := read_table(path)[chosen.episode]).dtype.kind not in "iuf":
-        films = {n for p in places for n in (p.name, *(each.name for each in p.cameras.values()))}
+        films = {n for p in places for n in (p.name, *(video.name for video in p.cameras.values()))}
         known = {folded(film) for film in films}
         if lone := sorted({n for n in map(str, names.tolist()) if folded(n) not in known}):
             notes.append(f"Rows without a video: {', '.join(lone[:5])}{' …' * (len(lone) > 5)}.")

@@ -108,18 +108,18 @@ class ZarrReplay(Format):
         """
         buffer = Buffer(Path(root))
         names = [name for name in buffer.names() if not tells(name)]
-        found = {name: buffer.array(f"data/{name}") for name in names}
-        for name, array in found.items():
+        arrays = {name: buffer.array(f"data/{name}") for name in names}
+        for name, array in arrays.items():
             if array.shape[0] != buffer.ends[-1]:
                 rows = f"{array.shape[0]} rows, but the last episode ends at {buffer.ends[-1]}"
                 raise DataError(f"data/{name} of {root} has {rows}")
-        cameras = _chosen(buffer, video, found, [n for n in found if _shows(found[n])])
-        action = _chosen(buffer, actions, found, [name for name in ACTIONS if name in found])[:1]
+        cameras = _chosen(buffer, video, arrays, [n for n in arrays if _shows(arrays[n])])
+        action = _chosen(buffer, actions, arrays, [name for name in ACTIONS if name in arrays])[:1]
         if not cameras or not action:
             missing = "actions: give --actions NAME" if cameras else "images: give --video NAME"
-            raise DataError(f"data/ of {root} has {', '.join(found)}, and no {missing}")
-        others = [n for n in found if n not in (*cameras, *action) and found[n].ndim == 2]
-        kept = _chosen(buffer, states, found, others)
+            raise DataError(f"data/ of {root} has {', '.join(arrays)}, and no {missing}")
+        others = [n for n in arrays if n not in (*cameras, *action) and arrays[n].ndim == 2]
+        kept = _chosen(buffer, states, arrays, others)
         options = {"rate": rate, "video": video, "actions": actions, "states": states}
         name = Path(root).resolve().name
         options["channels"] = channels
@@ -139,7 +139,9 @@ class ZarrReplay(Format):
                 "frames": buffer.ends[-1],
             },
             options=options | {"pixel_range": typed(pixel_range), "follow_links": follow_links},
-            notes=_notes(recordings, [n for n in (*found, *buffer.names("SUTO")) if n not in used]),
+            notes=_notes(
+                recordings, [n for n in (*arrays, *buffer.names("SUTO")) if n not in used]
+            ),
             summary=f"The replay buffer {name}",
         )
 
@@ -246,7 +248,7 @@ class Buffer(ArrayStore):
         Raises:
             DataError: nothing says it, or what does contradicts itself.
         """
-        place = next((each for each in (*PLACES, *NUMBERED) if each in self._group), ENDS)
+        place = next((name for name in (*PLACES, *NUMBERED) if name in self._group), ENDS)
         if (count := self.array(place).shape[0]) > MOST_FRAMES:
             raise DataError(f"{place} of {self.path} claims {count:,} episodes")
         if place in NUMBERED:
@@ -281,11 +283,11 @@ def _shows(array: Any) -> bool:
 
 
 def _chosen(
-    buffer: Buffer, text: str | None, found: Mapping[str, Any], default: list[str]
+    buffer: Buffer, text: str | None, arrays: Mapping[str, Any], default: list[str]
 ) -> list[str]:
     """The names in `text`, or the default ones."""
     names = default if text is None else list(words(text))
     for name in names:
-        if name not in found:
-            raise DataError(f"{buffer.path} has no data/{name}{suggest(name, found)}")
+        if name not in arrays:
+            raise DataError(f"{buffer.path} has no data/{name}{suggest(name, arrays)}")
     return names

@@ -85,7 +85,8 @@ def _delay_chart(found: Survey) -> Chart | None:
     if seen is None:
         return None
     ticks = [(float(shift), f"{shift:+d}" if shift else "0") for shift in seen.shifts]
-    curve = Curve("", "model", list(map(float, seen.shifts)), [100 * each for each in seen.told])
+    shares = [100 * share for share in seen.explained]
+    curve = Curve("", "model", list(map(float, seen.shifts)), shares)
     shaded = None if seen.delay is None else (seen.delay - 0.3, seen.delay + 0.3)
     return Chart(
         "New information about the action, by delay",

@@ -116,8 +116,8 @@ def test_a_stack_of_floats_is_no_depth():
 def test_a_stack_in_which_little_moves_is_one():
     screens = np.zeros_like(SCREENS)
     screens[9:, 3, 3] = 200
-    assert frames_of(stacked(screens=screens)).shown == "newest-last"
-    assert frames_of(stacked(3, screens=screens)).shown == "newest-last"
+    assert frames_of(stacked(screens=screens)).colour_order == "newest-last"
+    assert frames_of(stacked(3, screens=screens)).colour_order == "newest-last"
 
 
 def test_colours_are_no_stack():
@@ -126,11 +126,11 @@ def test_colours_are_no_stack():
     grey = np.repeat(SCREENS[..., None], 3, 3)
     for images in (still, RGBA[..., :3], grey, grey[:1]):
         frames = frames_of(images)
-        assert frames.shown == "rgb"
+        assert frames.colour_order == "rgb"
         np.testing.assert_array_equal(np.stack([*frames.read([0])])[0], images[0])
-    assert frames_of(opaque).shown == "rgba"
+    assert frames_of(opaque).colour_order == "rgba"
     with pytest.raises(DataError, match="four channels"):
-        frames_of(np.repeat(RGBA[:1], COUNT, 0)).shown  # noqa: B018
+        frames_of(np.repeat(RGBA[:1], COUNT, 0)).colour_order  # noqa: B018
 
 
 def test_the_command_names_channels(tmp_path):

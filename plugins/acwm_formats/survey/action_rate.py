@@ -67,18 +67,18 @@ class ActionRate:
     @property
     def question(self) -> str:
         """What is to be decided, if it `is_open`."""
-        value, total = (f"{100 * each:.0f} %" for each in self.told)
-        told = f"{total} of the sum is read from the frames, {value} of the value"
+        value, total = (f"{100 * share:.0f} %" for share in self.told)
+        shares = f"{total} of the sum is read from the frames, {value} of the value"
         if self.follows == "sum":
             return (
                 "the video follows their sum over a frame rather than the value that was "
-                f"used ({told}): are they velocities or forces? Import again with --action-kind "
+                f"used ({shares}): are they velocities or forces? Import again with --action-kind "
                 "velocity, torque "
                 "or delta, or with absolute if they are targets that the robot reaches late"
             )
         if self.follows == "value":
             return (
-                f"the video follows their values rather than their sum over a frame ({told}): if "
+                f"the video follows their values rather than their sum over a frame ({shares}): if "
                 f"they are targets, give --action-kind absolute; velocities or forces? {ALSO}"
             )
         return f"velocities or forces? Import again with {ALSO}"
@@ -109,15 +109,15 @@ class ActionRate:
     @classmethod
     def of_source(cls, source: Mapping[str, Any]) -> ActionRate | None:
         """What an import wrote; None if frames have an action each, or nothing tells."""
-        found = source.get(SOURCE)
-        if not isinstance(found, Mapping):
+        stored = source.get(SOURCE)
+        if not isinstance(stored, Mapping):
             return None
         try:
-            known = cast(Mapping[str, Any], found)
+            known = cast(Mapping[str, Any], stored)
             low, high = map(float, known["per_frame"])
             value, total = map(float, known["told"])
             follows = str(known["follows"])
-            made = cls(
+            rate = cls(
                 (low, high),
                 float(known["unused"]),
                 tuple(map(str, known["kinds"])),
@@ -127,8 +127,8 @@ class ActionRate:
             )
         except (KeyError, TypeError, ValueError):
             return None
-        numbers = (low, high, made.unused, value, total)
-        return made if all(map(math.isfinite, numbers)) and high > 0 else None
+        numbers = (low, high, rate.unused, value, total)
+        return rate if all(map(math.isfinite, numbers)) and high > 0 else None
 
 
 def _times(number: float) -> str:
@@ -158,8 +158,8 @@ def followed(
     if not varies.any():
         return "", (0.0, 0.0)
     seen = [Seen(side, varies, SHIFTS[-1]) for side in sides]
-    whole = _shares([np.stack([each.plain(shift) for shift in SHIFTS]) for each in seen])
-    news = _shares([np.stack([each.new(shift) for shift in SHIFTS]) for each in seen])
+    whole = _shares([np.stack([side.plain(shift) for shift in SHIFTS]) for side in seen])
+    news = _shares([np.stack([side.new(shift) for shift in SHIFTS]) for side in seen])
     limit = float(stats.t.isf(CERTAIN / 2, whole.shape[1] - 1))
     more, newer = whole[1] - whole[0], news[1] - news[0]
     if _size(more) > limit and more.mean() > LEAST:
@@ -175,10 +175,10 @@ def _shares(parts: Sequence[Numbers]) -> Numbers:
     Args:
         parts: of each ``[shift, action, group]``.
     """
-    best = np.clip(np.max([each.mean(2).max(0) for each in parts], axis=0), 0, 1)
+    best = np.clip(np.max([part.mean(2).max(0) for part in parts], axis=0), 0, 1)
     weights = best / max(best.sum(), 1e-12)
-    rows = [np.einsum("sag,a->sg", each, weights) for each in parts]
-    return np.stack([each[int(each.mean(1).argmax())] for each in rows])
+    rows = [np.einsum("sag,a->sg", part, weights) for part in parts]
+    return np.stack([row[int(row.mean(1).argmax())] for row in rows])
 
 
 def _means(shares: Numbers) -> tuple[float, float]:

@@ -57,8 +57,8 @@ class Following:
 
     Attributes:
         shifts: the delays that were tried, in frames.
-        told: for each, the share of what is new in an action that the change of frames tells; the
-            mean over actions, weighted by how well they are read.
+        explained: for each, the share of what is new in an action that the change of frames tells;
+            the mean over actions, weighted by how well they are read.
         read: the share of each action's variance that can be read from the frames; NaN if the
             action is constant.
         follows: whether more can be read than from another episode's frames.
@@ -69,7 +69,7 @@ class Following:
     """
 
     shifts: tuple[int, ...]
-    told: tuple[float, ...]
+    explained: tuple[float, ...]
     read: tuple[float, ...]
     follows: bool
     delay: int | None
@@ -81,9 +81,9 @@ def following(moments: Sequence[Moments]) -> Following | None:
     """Estimate it; None if episodes are too few or too short, or no action ever changes."""
     if not moments:
         return None
-    longest = float(np.median([len(each.actions) for each in moments]))
+    longest = float(np.median([len(stretch.actions) for stretch in moments]))
     reach = int(min(SHIFTS, (longest - BEFORE - 4) // 2))
-    fit = [each for each in moments if len(each.actions) >= 2 * reach + BEFORE + 4]
+    fit = [stretch for stretch in moments if len(stretch.actions) >= 2 * reach + BEFORE + 4]
     varies = varying(fit)
     if reach < 1 or len(fit) < FEWEST or not varies.any():
         return None
@@ -93,19 +93,19 @@ def following(moments: Sequence[Moments]) -> Following | None:
     new = np.stack([seen.new(shift) for shift in shifts])
     best = np.clip(plain.mean(2).max(0), 0, 1)
     weights = best / max(best.sum(), 1e-12)
-    told = np.einsum("sag,a->sg", new, weights)
-    follows = any(_shown(rows) for rows in (np.einsum("sag,a->sg", plain, weights), told))
-    delay, confidence = _delay(told, shifts) if follows else (None, 0.0)
+    explained = np.einsum("sag,a->sg", new, weights)
+    follows = any(_shown(rows) for rows in (np.einsum("sag,a->sg", plain, weights), explained))
+    delay, confidence = _delay(explained, shifts) if follows else (None, 0.0)
     read = np.full(len(varies), np.nan)
     read[varies] = best
-    means = tuple(told.mean(1).tolist())
-    count = len({each.episode for each in fit})
+    means = tuple(explained.mean(1).tolist())
+    count = len({stretch.episode for stretch in fit})
     return Following(shifts, means, tuple(read.tolist()), follows, delay, confidence, count)
 
 
 def varying(moments: Sequence[Moments]) -> NDArray[np.bool_]:
     """Which actions ever change, ``[A]``."""
-    every = np.concatenate([each.actions for each in moments])
+    every = np.concatenate([stretch.actions for stretch in moments])
     return every.std(0) > 1e-6 * np.maximum(np.abs(every).max(0), 1e-12)
 
 
@@ -146,7 +146,7 @@ class Seen:
 
     def plain(self, shift: int) -> Numbers:
         """How well the actions `shift` frames before are read, ``[action, group]``."""
-        ones = [np.ones((len(each), 1)) for each in self.change]
+        ones = [np.ones((len(change), 1)) for change in self.change]
         inputs = [np.concatenate(pair, 1) for pair in zip(self.change, self.place, strict=True)]
         return gains(ones, inputs, standard(self._actions(shift)), self.groups, self.others)
 
@@ -158,11 +158,11 @@ class Seen:
         count = actions[0].shape[1]
         both = [np.concatenate(pair, 1) for pair in zip(actions, self.change, strict=True)]
         left = residuals(known, both, self.groups)
-        news = [each[:, :count] for each in left]
+        news = [rows[:, :count] for rows in left]
         moved = np.concatenate(news).var(0) > STILL * np.concatenate(actions).var(0)
-        changes = standard([each[:, count:] for each in left])
-        found = gains(known, changes, standard(_cut(news)), self.groups, self.others)
-        return np.where(moved[:, None], found, 0)
+        changes = standard([rows[:, count:] for rows in left])
+        shares = gains(known, changes, standard(_cut(news)), self.groups, self.others)
+        return np.where(moved[:, None], shares, 0)
 
     def _actions(self, shift: int) -> list[Numbers]:
         return [a[r - shift] for a, r in zip(self.actions, self.rows, strict=True)]
@@ -179,27 +179,27 @@ def _cut(rows: Sequence[Numbers]) -> list[Numbers]:
     every = np.concatenate(rows)
     common = 1.4826 * np.median(np.abs(every), 0)
     most = 3 * np.maximum(common, 0.2 * every.std(0))
-    return [np.clip(each, -most, most) for each in rows]
+    return [np.clip(values, -most, most) for values in rows]
 
 
 def _groups(moments: Sequence[Moments]) -> NDArray[np.int64]:
     """The number of each stretch's episode; of the stretch itself if episodes are too few."""
-    names = list(dict.fromkeys(each.episode for each in moments))
+    names = list(dict.fromkeys(stretch.episode for stretch in moments))
     if len(names) < FEWEST:
         return np.arange(len(moments))
-    return np.array([names.index(each.episode) for each in moments])
+    return np.array([names.index(stretch.episode) for stretch in moments])
 
 
 def _others(moments: Sequence[Moments], groups: NDArray[np.int64]) -> list[list[int]]:
     """For each stretch, those of other groups that begin most nearly at the same time."""
-    starts, order = np.array([each.start for each in moments]), np.arange(len(moments))
-    found: list[list[int]] = []
+    starts, order = np.array([stretch.start for stretch in moments]), np.arange(len(moments))
+    others: list[list[int]] = []
     for index in order:
         strangers = np.roll(order, -index)[1:]
         strangers = strangers[groups[strangers] != groups[index]]
         gap = np.abs(starts[strangers] - starts[index])
-        found.append(strangers[np.argsort(gap, kind="stable")[:OTHERS]].tolist())
-    return found
+        others.append(strangers[np.argsort(gap, kind="stable")[:OTHERS]].tolist())
+    return others
 
 
 def _shown(values: Numbers) -> bool:
@@ -207,7 +207,7 @@ def _shown(values: Numbers) -> bool:
     return bool(((_sizes(values) > _limit(values)) & (values.mean(1) > LEAST)).any())
 
 
-def _delay(told: Numbers, shifts: Sequence[int]) -> tuple[int | None, float]:
+def _delay(explained: Numbers, shifts: Sequence[int]) -> tuple[int | None, float]:
     """The first change that notably tells of an action, in most resamples, and their share.
 
     It begins the run of such changes that holds the most telling one: the frames that a policy
@@ -215,12 +215,14 @@ def _delay(told: Numbers, shifts: Sequence[int]) -> tuple[int | None, float]:
     counts as well, so a delay is uncertain if an earlier change may tell something, too.
     """
     early = [shift < 0 for shift in shifts]
-    above = told - np.median(told[early], 0)  # what the regression finds in nothing
+    above = explained - np.median(explained[early], 0)  # what the regression finds in nothing
     certain = _sizes(above) > _limit(above)
     if not certain.any():
         return None, 0.0
     notable = NOTABLE * above.mean(1)[certain].max()
-    picks = np.random.default_rng(0).integers(told.shape[1], size=(RESAMPLES, told.shape[1]))
+    picks = np.random.default_rng(0).integers(
+        explained.shape[1], size=(RESAMPLES, explained.shape[1])
+    )
     again = above[:, picks]
     means = again.mean(2)
     starts = _starts((_sizes(again) > LIKELY) & (means >= notable), means)

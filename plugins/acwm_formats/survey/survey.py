@@ -84,7 +84,7 @@ class Survey:
             *_of_duplicates(self),
             *(_of_tests(self.lengths) if self.card.source else ()),
         ]
-        return sorted(every, key=lambda each: ("bad", "note", "good").index(each.level))
+        return sorted(every, key=lambda finding: ("bad", "note", "good").index(finding.level))
 
     @property
     def rate(self) -> ActionRate | None:
@@ -94,21 +94,21 @@ class Survey:
     @property
     def headline(self) -> str:
         """The verdict: whether the video follows the actions, and when."""
-        found = self.following
-        if found is None:
+        following = self.following
+        if following is None:
             return "Too little to tell whether the video follows the actions"
-        if not found.follows:
+        if not following.follows:
             return "Nothing in the video follows the actions"
         if self.rate and self.rate.is_open:
             return "The video follows the actions; the delay is unknown until their kind is known"
-        if found.delay is None:
+        if following.delay is None:
             return "The video follows the actions; the delay is unknown"
-        if found.confidence < SURE:
+        if following.confidence < SURE:
             return "The video follows the actions; the delay is uncertain"
-        if not found.delay:
+        if not following.delay:
             return "The video follows the actions, at once"
-        late = "late" if found.delay > 0 else "early"
-        return f"The video follows the actions {_frames(abs(found.delay))} {late}"
+        late = "late" if following.delay > 0 else "early"
+        return f"The video follows the actions {_frames(abs(following.delay))} {late}"
 
 
 def survey(path: str | Path) -> Survey:
@@ -126,29 +126,29 @@ def survey(path: str | Path) -> Survey:
         split: EpisodeDataset(path, split) for split in card.splits
     }
     frames, moments, unread = FrameFacts(), list[Moments](), Unread()
-    for each in stretches(data, unread):
-        place = each.split, each.episode
-        frames.add((*place, each.start), each.video, each.actions, card.environment.views)
-        moments.append(Moments(place, each.start, small(each.video), each.actions))
-    found, compared = near_duplicates(data, unread)
+    for stretch in stretches(data, unread):
+        place = stretch.split, stretch.episode
+        frames.add((*place, stretch.start), stretch.video, stretch.actions, card.environment.views)
+        moments.append(Moments(place, stretch.start, small(stretch.video), stretch.actions))
+    duplicates, compared = near_duplicates(data, unread)
     return Survey(
         path=path,
         card=card,
-        lengths={split: each.lengths for split, each in data.items()},
+        lengths={split: split_data.lengths for split, split_data in data.items()},
         actions=action_facts(data, card.environment.action, unread),
         frames=frames,
         following=following(moments),
-        near_duplicates=found,
+        near_duplicates=duplicates,
         compared=compared,
         unread=unread,
     )
 
 
-def short_form(found: Survey) -> list[str]:
+def short_form(survey: Survey) -> list[str]:
     """The verdict and what is wrong, in lines for a terminal."""
     marks = {"bad": "✗", "note": "·", "good": "✓"}
-    lines = [f"{marks[each.level]} {each.text}" for each in found.findings]
-    return [*lines, f"all of it, with videos: acwm data report {found.path}"]
+    lines = [f"{marks[finding.level]} {finding.text}" for finding in survey.findings]
+    return [*lines, f"all of it, with videos: acwm data report {survey.path}"]
 
 
 def _frames(count: int) -> str:
@@ -172,8 +172,8 @@ def _of_rate(rate: ActionRate | None) -> Iterator[Finding]:
         yield Finding(level, f"{rate.sentence}. {rate.question[0].upper()}{rate.question[1:]}")
 
 
-def _of_following(found: Survey) -> Iterator[Finding]:
-    seen, says = found.following, found.headline
+def _of_following(survey: Survey) -> Iterator[Finding]:
+    seen, says = survey.following, survey.headline
     if seen is None:
         why = "a verdict needs at least four episodes of a dozen frames, and actions that change"
         yield Finding("note", f"{says}: {why}")
@@ -182,7 +182,7 @@ def _of_following(found: Survey) -> Iterator[Finding]:
             f"in {seen.episodes} episodes, frames show no more of their own actions than of others"
         )
         yield Finding("bad", f"{says}: {why}; a model would learn to ignore them")
-    elif found.rate and found.rate.is_open:
+    elif survey.rate and survey.rate.is_open:
         yield Finding("note", says)
     elif seen.delay is None:
         yield Finding("note", f"{says}: actions change too steadily")
@@ -197,34 +197,35 @@ def _of_following(found: Survey) -> Iterator[Finding]:
         yield Finding("good", f"{says}: delay 0, confidence {_sure(seen.confidence)}")
 
 
-def _of_actions(found: Survey) -> Iterator[Finding]:
-    constant = [each.name for each in found.actions if each.constant]
+def _of_actions(survey: Survey) -> Iterator[Finding]:
+    constant = [action.name for action in survey.actions if action.constant]
     if constant:
         yield Finding("note", f"constant: {', '.join(constant)}; nothing can be learned from them")
-    recorded = bool(found.card.source)  # the bounds of a simulator are not taken from its data
-    for each in found.actions:
-        if each.narrow is not None and not each.constant:
-            near, far = each.quantiles
+    recorded = bool(survey.card.source)  # the bounds of a simulator are not taken from its data
+    for action in survey.actions:
+        if action.narrow is not None and not action.constant:
+            near, far = action.quantiles
             text = (
-                f"{each.name} has outliers: 98 % of its values lie from {near:.4g} to {far:.4g}, "
-                f"in {each.narrow:.1%} of its bounds {each.bounds[0]:.4g} to {each.bounds[1]:.4g}"
+                f"{action.name} has outliers: 98 % of its values lie from {near:.4g} to {far:.4g}, "
+                f"in {action.narrow:.1%} of its bounds {action.bounds[0]:.4g} to "
+                f"{action.bounds[1]:.4g}"
             )
             advice = "; import it with --bounds quantile"
             yield Finding("bad", text + advice) if recorded else Finding("note", text)
-        if each.choices and recorded:
+        if action.choices and recorded:
             text = (
-                f"{each.name} takes the {each.choices} whole numbers from {each.least:g} to "
-                f"{each.most:g}: models take them as an amount. If they are choices, record "
+                f"{action.name} takes the {action.choices} whole numbers from {action.least:g} to "
+                f"{action.most:g}: models take them as an amount. If they are choices, record "
                 "a column of 0 and 1 for each"
             )
             yield Finding("note", text)
-        if each.outside:
-            yield Finding("note", f"{each.outside:.2%} of {each.name} are outside its bounds")
+        if action.outside:
+            yield Finding("note", f"{action.outside:.2%} of {action.name} are outside its bounds")
 
 
-def _of_frames(found: Survey) -> Iterator[Finding]:
-    facts = found.frames
-    asked = PHRASES if found.card.source else PHRASES.keys() - {"repeated", "frozen"}
+def _of_frames(survey: Survey) -> Iterator[Finding]:
+    facts = survey.frames
+    asked = PHRASES if survey.card.source else PHRASES.keys() - {"repeated", "frozen"}
     counts = {name: getattr(facts, name) for name in PHRASES if name in asked}
     if not any(counts.values()):
         yield Finding("good", f"{facts.frames:,} frames were looked at; none is defective")
@@ -240,22 +241,22 @@ def _of_frames(found: Survey) -> Iterator[Finding]:
 def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
     if not lengths.keys() - {"train"}:
         yield Finding("note", f"no test episodes: a verdict needs {MIN_EPISODES}")
-    for split, each in lengths.items():
-        if split != "train" and len(each) < MIN_EPISODES:
+    for split, episodes in lengths.items():
+        if split != "train" and len(episodes) < MIN_EPISODES:
             yield Finding(
                 "note",
-                f"{split} has {len(each)} episodes: an interval and a verdict need {MIN_EPISODES}. "
-                f"Record more, or import again with --test-episodes {MIN_EPISODES}",
+                f"{split} has {len(episodes)} episodes: an interval and a verdict need "
+                f"{MIN_EPISODES}. Record more, or import again with --test-episodes {MIN_EPISODES}",
             )
 
 
-def _of_duplicates(found: Survey) -> Iterator[Finding]:
-    if found.near_duplicates:
-        first, count = found.near_duplicates[0], len(found.near_duplicates)
+def _of_duplicates(survey: Survey) -> Iterator[Finding]:
+    if survey.near_duplicates:
+        first, count = survey.near_duplicates[0], len(survey.near_duplicates)
         yield Finding(
             "bad",
-            f"{count} of {found.compared} test episodes nearly equal training episodes, e.g. "
+            f"{count} of {survey.compared} test episodes nearly equal training episodes, e.g. "
             f"{first.split} {first.episode} and train {first.trained}: scores will be too good",
         )
-    elif found.compared:
-        yield Finding("good", f"none of {found.compared} test episodes equals a training episode")
+    elif survey.compared:
+        yield Finding("good", f"none of {survey.compared} test episodes equals a training episode")
