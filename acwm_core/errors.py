@@ -69,7 +69,9 @@ def noting(
     except unless:
         raise
     except Exception as error:
-        error.add_note(Note(where + _line(error, {_package(each) for each in components})))
+        error.add_note(
+            Note(where + _line(error, {_package(component) for component in components}))
+        )
         raise
 
 
@@ -114,7 +116,7 @@ def sentence(error: BaseException) -> str:
     return ", ".join([message, *notes(error)])
 
 
-def check_shape(component: object, method: str, made: Any, *shape: int) -> None:
+def check_shape(component: object, method: str, result: Any, *shape: int) -> None:
     """Refuse what a method of a component returned unless it has this shape.
 
     A wrong shape might be broadcast, and give a wrong result instead of an error.
@@ -122,19 +124,19 @@ def check_shape(component: object, method: str, made: Any, *shape: int) -> None:
     Args:
         component: the component, which the message names.
         method: the method, for the message.
-        made: what it returned: an array or a tensor.
+        result: what it returned: an array or a tensor.
         *shape: the shape it must have; -1 stands for any length.
 
     Raises:
         PluginError: it has another shape, or none.
     """
-    found: Any = getattr(made, "shape", None)
+    actual: Any = getattr(result, "shape", None)
     if (
-        found is None
-        or len(found) != len(shape)
-        or any(wanted not in (-1, length) for length, wanted in zip(found, shape, strict=True))
+        actual is None
+        or len(actual) != len(shape)
+        or any(wanted not in (-1, length) for length, wanted in zip(actual, shape, strict=True))
     ):
-        gave = f"{made!r:.40}" if found is None else f"the shape {[*found]}"
+        gave = f"{result!r:.40}" if actual is None else f"the shape {[*actual]}"
         wanted = f"{[*shape]}".replace("-1", "n")
         owner = f"{type(component).__module__}.{type(component).__qualname__}"
         raise PluginError(f"{owner}.{method} gives {gave}, not the shape {wanted}")
@@ -166,7 +168,7 @@ def suggest(name: str, known: Iterable[str]) -> str:
     import difflib
 
     names = sorted(known)
-    near = [each for each in names if each.endswith(f".{name}")]  # a task without its environment
+    near = [full for full in names if full.endswith(f".{name}")]  # a task without its environment
     near = near or difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)  # YAML has numbers
     if near:
         return f"; did you mean {near[0]!r}?"

@@ -92,8 +92,8 @@ def progress_bar(
             return "  ".join(filter(None, (rate, note())))
 
         def print_line() -> None:
-            made = int(bar.tasks[0].completed)
-            of = made if total is None else f"{made}/{total}"
+            finished = int(bar.tasks[0].completed)
+            of = finished if total is None else f"{finished}/{total}"
             left = bar.tasks[0].time_remaining
             until = f"  {duration(left)} left" if left else ""
             line = f"{what}  {of} {unit}  {text_now()}{until}"
@@ -261,7 +261,7 @@ def _guards(node: ast.AST, line: int) -> bool:
     """Whether a statement keeps a line from being run in processes that import the script."""
     if not isinstance(node, ast.If):
         return False
-    names = [each.id for each in ast.walk(node.test) if isinstance(each, ast.Name)]
+    names = [part.id for part in ast.walk(node.test) if isinstance(part, ast.Name)]
     if "__name__" not in names:
         return False
     return node.lineno <= line <= (node.end_lineno or line)

@@ -114,11 +114,11 @@ def written_whole(path: Path) -> Generator[Path]:
     except BaseException as error:
         is_full = shutil.disk_usage(path.parent).free < FULL
         partial.unlink(missing_ok=True)
-        found = disk_error(error)
-        if found is None and is_full and isinstance(error, Exception):
-            found = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        if found is not None and found.filename in (None, str(partial)):
-            raise OSError(found.errno, found.strerror, str(path)) from error
+        cause = disk_error(error)
+        if cause is None and is_full and isinstance(error, Exception):
+            cause = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if cause is not None and cause.filename in (None, str(partial)):
+            raise OSError(cause.errno, cause.strerror, str(path)) from error
         raise
 
 
@@ -153,16 +153,16 @@ def made_whole(folder: Path) -> Generator[Path]:
     partial = folder.with_name(f".{folder.name}{PARTIAL}")
     partial.mkdir(parents=True, exist_ok=True)
     with held(partial, folder):
-        made = partial / folder.name
+        inner = partial / folder.name
         try:
-            shutil.rmtree(made, ignore_errors=True)  # left by a killed process
-            made.mkdir(parents=True)
-            yield made
+            shutil.rmtree(inner, ignore_errors=True)  # left by a killed process
+            inner.mkdir(parents=True)
+            yield inner
             if folder.exists() and any(folder.iterdir()):
                 raise DataError(
                     f"another command has created {folder} in the meantime: use that one"
                 )
-            made.replace(folder)
+            inner.replace(folder)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
@@ -178,11 +178,11 @@ def writing(path: Path, instead: str = "") -> Generator[None]:
     try:
         yield
     except Exception as error:
-        found = disk_error(error) or (error if isinstance(error, OSError) else None)
-        if found is None or isinstance(error, AcwmError):
+        cause = disk_error(error) or (error if isinstance(error, OSError) else None)
+        if cause is None or isinstance(error, AcwmError):
             raise
         raise DataError(
-            f"cannot write to {path} ({found.strerror or found}): free disk space or fix the "
+            f"cannot write to {path} ({cause.strerror or cause}): free disk space or fix the "
             f"permissions, and run the same command again to resume{', ' * bool(instead)}{instead}"
         ) from error
 
@@ -221,14 +221,14 @@ def remove_partial(folder: Path, of: str = "") -> None:
 
 
 @contextlib.contextmanager
-def held(folder: Path, told: Path | None = None) -> Generator[None]:
+def held(folder: Path, named: Path | None = None) -> Generator[None]:
     """Lock `folder` against other writers; the lock ends with the process, however it ends.
 
     On a file system without locks a second writer is not refused and may make the first one fail,
     but files under their final names are complete even then.
 
     Args:
-        told: the folder to name in the message, if it is another one.
+        named: the folder to name in the message, if it is another one.
 
     Raises:
         DataError: another process holds the lock.
@@ -237,7 +237,7 @@ def held(folder: Path, told: Path | None = None) -> Generator[None]:
     with _locked(lock, ENDING_SECONDS) as is_held:
         if not is_held:
             raise DataError(
-                f"another command is writing to {told or folder}; wait for it or choose another "
+                f"another command is writing to {named or folder}; wait for it or choose another "
                 f"folder{_holder(lock)}"
             )
         yield
@@ -475,11 +475,11 @@ def parse_json(data: bytes | str) -> Any:
         ValueError: it is something else.
     """
     try:
-        found = json.loads(data)
-        _finite_json(found)
+        content = json.loads(data)
+        _finite_json(content)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
-    return found
+    return content
 
 
 def parse_yaml(text: str, loader: Any = None) -> Any:

@@ -197,10 +197,12 @@ class Component:
 
     def create_as(self, base: type[Made], **params: Any) -> Made:
         """Construct the component; `PluginError` if the result is not a `base`."""
-        made = self.create(**params)
-        if not isinstance(made, base):
-            raise PluginError(f"{self.part} returns a {type(made).__name__}, not a {base.__name__}")
-        return made
+        instance = self.create(**params)
+        if not isinstance(instance, base):
+            raise PluginError(
+                f"{self.part} returns a {type(instance).__name__}, not a {base.__name__}"
+            )
+        return instance
 
     def install_command(self, module: str) -> str:
         """The command that installs `module`, by the plugin's extra if it names one."""
@@ -461,7 +463,7 @@ class Catalog:
                 loaded.append((point, point.load()))
         name_of = functools.cache(lambda distribution: distribution and distribution.name)
         for point, plugin in sorted(
-            loaded, key=lambda each: not hasattr(each[1], "register_kinds")
+            loaded, key=lambda entry: not hasattr(entry[1], "register_kinds")
         ):
             with self._reporting(point):  # a distribution reads its file again for each answer
                 self.add_plugin(plugin, point.name, name_of(point.dist))
@@ -477,20 +479,20 @@ class Catalog:
 
     def _entry_points(self) -> list[importlib.metadata.EntryPoint]:
         """The entry points of all distributions; those with a damaged file become problems."""
-        found: dict[tuple[str, str], importlib.metadata.EntryPoint] = {}
+        points: dict[tuple[str, str], importlib.metadata.EntryPoint] = {}
         for distribution in importlib.metadata.distributions():
             try:
                 for point in distribution.entry_points.select(group=PROJECT):
-                    found.setdefault((point.name, point.value), point)
+                    points.setdefault((point.name, point.value), point)
             except Exception as error:  # possibly of an unrelated package
                 where = str(getattr(distribution, "_path", distribution))
                 self.problems.append(Problem(where, sentence(error)))
-        return [found[key] for key in sorted(found)]
+        return [points[key] for key in sorted(points)]
 
 
 @functools.cache
 def catalog() -> Catalog:
     """The catalog of this process, filled from the installed entry points on first use."""
-    found = Catalog()
-    found.load_entry_points()
-    return found
+    filled = Catalog()
+    filled.load_entry_points()
+    return filled

@@ -117,8 +117,8 @@ class CodecChecks(Suite):
         """
         latents = self._codec.encode(self._clip(batch=4))
         mean, spread = latents.mean().item(), latents.std().item()
-        found = f"latents have mean {mean:.2g} and standard deviation {spread:.2g}"
-        expect(abs(mean) < 3 and 0.1 < spread < 10, f"{found}, not about 0 and 1")
+        moments = f"latents have mean {mean:.2g} and standard deviation {spread:.2g}"
+        expect(abs(mean) < 3 and 0.1 < spread < 10, f"{moments}, not about 0 and 1")
 
     def encoding_repeats_and_leaves_no_trace(self) -> None:
         """Encode the same clip to the same latents, without changing the input or weights."""

@@ -66,11 +66,11 @@ class ConditionerChecks(Suite):
     def embeds_actions(self) -> None:
         """Construct the conditioner and embed actions as modulation, context or both."""
         expect_is_a(self._conditioner, Conditioner)
-        made = self._conditioner(self._actions())
-        expect_is_a(made, Conditioning)
-        named = made.conditioner is self._conditioner
+        conditioning = self._conditioner(self._actions())
+        expect_is_a(conditioning, Conditioning)
+        named = conditioning.conditioner is self._conditioner
         expect(named, "the Conditioning names another conditioner")
-        empty = made.modulation is None and made.context is None
+        empty = conditioning.modulation is None and conditioning.context is None
         expect(not empty, "it returns neither modulation nor context")
 
     def shapes_follow_the_length(self) -> None:
@@ -97,8 +97,8 @@ class ConditionerChecks(Suite):
         conditioning = self.make(**FIT, widths=WIDTHS)(self._actions())
         for layer, width in enumerate(WIDTHS):
             tokens = noise((1, 4, TOKENS, width), seed=1)
-            made = conditioning.inject(layer, tokens)
-            expect_equal("tokens come back", [*made.shape], [*tokens.shape])
+            injected = conditioning.inject(layer, tokens)
+            expect_equal("tokens come back", [*injected.shape], [*tokens.shape])
 
     def every_action_counts(self) -> None:
         """Let each action that leads to a frame change something."""

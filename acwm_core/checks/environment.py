@@ -111,9 +111,9 @@ class EnvironmentChecks(TaskChecks):
     def state_matches_card(self) -> None:
         """Return exactly the state fields of the card, in their shapes, as finite numbers."""
         states = self.episode.states
-        found = {name: values.shape[1:] for name, values in states.items()}
+        actual = {name: values.shape[1:] for name, values in states.items()}
         declared = {field.name: field.shape for field in self.card.state}
-        expect(found == declared, f"the state has {found}; the card says {declared}")
+        expect(actual == declared, f"the state has {actual}; the card says {declared}")
         for name, values in states.items():
             expect(values.dtype.kind in "fiub", f"state {name!r} is {values.dtype}, not numbers")
             expect(np.all(np.isfinite(values)), f"state {name!r} is not finite")
@@ -216,10 +216,12 @@ class EnvironmentChecks(TaskChecks):
         card = self.card
         if not card.symmetries:
             raise NotTried("its card declares no symmetries")
-        whole = {each.name for each in group(*card.symmetries)}
-        found = {each.name for each in card.symmetries}
-        lacking = ", ".join(sorted(whole - found))
-        expect(found == whole, f"the symmetries do not form a group: {lacking} follows from them")
+        whole = {symmetry.name for symmetry in group(*card.symmetries)}
+        declared = {symmetry.name for symmetry in card.symmetries}
+        lacking = ", ".join(sorted(whole - declared))
+        expect(
+            declared == whole, f"the symmetries do not form a group: {lacking} follows from them"
+        )
         for symmetry in card.symmetries:
             actions = symmetry.of_actions(self.beginning.actions)
             turned = simulate(
@@ -247,14 +249,15 @@ class EnvironmentChecks(TaskChecks):
 
         Values that look alike are equal, and those of rows that do not exist do not count.
         """
-        usual, found = (
-            np.asarray(each.states[field.name], np.float64) for each in (self.beginning, turned)
+        usual, values = (
+            np.asarray(episode.states[field.name], np.float64)
+            for episode in (self.beginning, turned)
         )
         wanted = self.card.transformed(symmetry, field.name, usual)
         if field.name in symmetry.headings:
-            off, largest = np.angle(np.exp(1j * (found - wanted)))[usual != 0], np.pi
+            off, largest = np.angle(np.exp(1j * (values - wanted)))[usual != 0], np.pi
         else:
-            off = encode(field, found) - encode(field, wanted)
+            off = encode(field, values) - encode(field, wanted)
             largest = np.abs(encode(field, wanted)).max()
             if field.present:
                 there = np.asarray(self.beginning.states[field.present]).reshape(len(off), -1) > 0
@@ -326,8 +329,8 @@ class EnvironmentChecks(TaskChecks):
     def same_bytes_in_a_fresh_process(self) -> None:
         """Give the same episode whatever this process did before."""
         make = functools.partial(self.make, size=self.size)
-        found = digests_elsewhere(make, self.spec(), BEGINNING)
-        _expect_same(self.beginning, found, "in a fresh process")
+        digests = digests_elsewhere(make, self.spec(), BEGINNING)
+        _expect_same(self.beginning, digests, "in a fresh process")
 
     def replayed_actions_reproduce_the_episode(self) -> None:
         """Depend on the policy only through its actions."""
@@ -359,11 +362,11 @@ class EnvironmentChecks(TaskChecks):
     def _other_than(self, usual: Episode, index: int) -> list[str]:
         """Take the usual action, and name what of the next frame is not as it was then."""
         frame, *_, info = self.environment.step(usual.actions[index])
-        found = {**info["state"], "video": frame}
+        reached = {**info["state"], "video": frame}
         wanted = {**usual.states, "video": usual.video}
         return [
             name
-            for name, value in found.items()
+            for name, value in reached.items()
             if not np.array_equal(value, wanted[name][index + 1], equal_nan=True)
         ]
 
@@ -403,11 +406,11 @@ def _first(episode: Episode, frames: int) -> Episode:
     )
 
 
-def _expect_same(episode: Episode, found: dict[str, str], when: str) -> None:
+def _expect_same(episode: Episode, digests: dict[str, str], when: str) -> None:
     expected = episode.digests()
-    expect(expected.keys() == found.keys(), f"the state fields differ {when}")
+    expect(expected.keys() == digests.keys(), f"the state fields differ {when}")
     for name, digest in expected.items():
-        expect(found[name] == digest, f"the same spec gives other {name} {when}")
+        expect(digests[name] == digest, f"the same spec gives other {name} {when}")
 
 
 def digests_elsewhere(

@@ -82,8 +82,8 @@ class EstimatorChecks(Suite):
         unknown = [name for name in estimator.instances if name not in names[1:]]
         expect(not unknown, f"the card has no instance {unknown[:1]} beside the background")
         ids = {0, *map(names.index, estimator.instances)}
-        found = set(np.unique(self._observation.masks))
-        expect(found <= ids, "masks hold ids that it does not list")
+        ids_in_masks = set(np.unique(self._observation.masks))
+        expect(ids_in_masks <= ids, "masks hold ids that it does not list")
         expect_is_a(estimator.physics, Physics)
         for field in (reading.field for reading in estimator.physics.readings):
             expect(field in listed, f"its physics needs {field!r}, which is not read")
@@ -93,9 +93,9 @@ class EstimatorChecks(Suite):
         masks = self._episode.masks
         for name in self._estimator.instances:
             instance = self._environment.card.instances.index(name)
-            true, found = masks == instance, self._observation.masks == instance
+            true, read = masks == instance, self._observation.masks == instance
             if true.sum() >= 20 * len(masks):
-                overlap = (true & found).sum() / (true | found).sum()
+                overlap = (true & read).sum() / (true | read).sum()
                 expect(overlap >= 0.5, f"masks of {name!r} have an IoU of {overlap:.2f}")
 
     def follows_what_moves(self) -> None:

@@ -50,9 +50,9 @@ class MetricChecks(Suite):
             return EnvironmentTrial(self._given)
         metrics, known = (catalog().registry(kind) for kind in ("metric", "environment"))
         plugin = metrics[self.name].plugin if self.name else None
-        installed = [each for each in known if not each.missing_modules()]
-        own = [each.name for each in installed if each.plugin == plugin]
-        others = [each.name for each in installed if each.plugin != plugin]
+        installed = [component for component in known if not component.missing_modules()]
+        own = [component.name for component in installed if component.plugin == plugin]
+        others = [component.name for component in installed if component.plugin != plugin]
         for tried in (*own, Disc, *others):
             with contextlib.suppress(Exception):  # skip environments that do not work
                 trial = EnvironmentTrial(tried)
@@ -107,7 +107,7 @@ class MetricChecks(Suite):
     def _predicted(self, predict: Callable[[Clip], Clip]) -> Prediction:
         """The same clip and branch, with predictions computed from the truth by `predict`."""
         clip, branches = self._perfect, self._perfect.branches
-        others = (replace(each, video=predict(each.target)) for each in branches)
+        others = (replace(branch, video=predict(branch.target)) for branch in branches)
         return replace(clip, video=predict(clip.target), branches=tuple(others))
 
     def _noisy(self, amount: float, seed: int = 0) -> Prediction:
@@ -180,8 +180,8 @@ class _DrawChecks(MetricChecks):
     """Checks of a metric on several draws of a clip."""
 
     def _noisy(self, amount: float, seed: int = 0) -> Prediction:
-        made = [super(_DrawChecks, self)._noisy(amount, seed + draw) for draw in range(4)]
-        return replace(made[0], draws=tuple(made))
+        draws = [super(_DrawChecks, self)._noisy(amount, seed + draw) for draw in range(4)]
+        return replace(draws[0], draws=tuple(draws))
 
     def draws_have_no_order(self) -> None:
         """Score draws the same in any order, and otherwise than the first of them alone."""
@@ -261,7 +261,7 @@ class SetMetricChecks(_OrderChecks):
         width = prediction.target.shape[-1]
         pairs = prediction.video, prediction.target
         moved = ([clip.roll(width * quarter // 4, -1) for clip in pairs] for quarter in range(4))
-        clips = (replace(prediction, video=made, target=true) for made, true in moved)
+        clips = (replace(prediction, video=video, target=true) for video, true in moved)
         return self._metric.distance(np.stack([self._metric.features(clip) for clip in clips]))
 
     def scores_a_set(self) -> None:

@@ -123,10 +123,10 @@ class DynamicsChecks(PredictionTrial):
         own = {id(parameter) for parameter in self._model.parameters()}
         listed = self._model.matrices()
         expect_is_a(listed, list)
-        found = [id(each) for each in listed]
-        expect({*found} <= own, "matrices lists something that is not a parameter of the model")
-        expect(len({*found}) == len(found), "matrices lists a parameter twice")
-        wrong = [tuple(each.shape) for each in listed if each.ndim != 2]
+        ids = [id(matrix) for matrix in listed]
+        expect({*ids} <= own, "matrices lists something that is not a parameter of the model")
+        expect(len({*ids}) == len(ids), "matrices lists a parameter twice")
+        wrong = [tuple(matrix.shape) for matrix in listed if matrix.ndim != 2]
         expect(not wrong, f"matrices lists a parameter of shape {(wrong or [()])[0]}")
 
     def weights_can_be_saved(self) -> None:
@@ -181,10 +181,10 @@ class DynamicsChecks(PredictionTrial):
         latents, modulation = self._inputs()
         usual, probe = self._predict(latents[:, :1], modulation), Probe([place])
         changed = self._predict(latents[:, :1], modulation, probe)
-        found = {wide for where, wide in probe.called if where == place}
+        widths = {wide for where, wide in probe.called if where == place}
         why = "so a conditioner that acts there has no effect"
-        expect(found, f"it never calls {method}, {why}")
-        expect_equal(f"{method} gets tokens of the width", [*found], [width])
+        expect(widths, f"it never calls {method}, {why}")
+        expect_equal(f"{method} gets tokens of the width", [*widths], [width])
         expect(not torch.equal(usual, changed), f"it ignores the tokens of {method}, {why}")
 
     def streams_what_it_predicts(self) -> None:
@@ -225,8 +225,8 @@ class DynamicsChecks(PredictionTrial):
         changed[:, -1] += 1
         try:
             usual, other = (
-                model.predict_states(given, probed(each), frames, draws(batch))
-                for each in (modulation, changed)
+                model.predict_states(given, probed(actions), frames, draws(batch))
+                for actions in (modulation, changed)
             )
         except RecipeError as error:  # it has yet to measure them
             raise NotTried(str(error)) from None
@@ -277,7 +277,7 @@ class DenoiserChecks(Suite):
         latents, sigma, conditioning = clip
         rows = slice(start, stop)
         inputs = further_inputs(self._model, *latents.shape)
-        now = {name: each[:, rows] for name, each in inputs.items()}
+        now = {name: values[:, rows] for name, values in inputs.items()}
         frames = conditioning.frames(start, stop)
         return self._model.extend(latents[:, rows], sigma[:, rows], frames, cache, **now)
 

@@ -55,19 +55,19 @@ def expect(condition: object, reason: str) -> None:
 def expect_is_a(value: object, base: type) -> None:
     """Fail the running check unless `value` is an instance of `base`."""
     if not isinstance(value, base):  # texts of large tensors take long
-        found = type(value).__name__
-        raise CheckFailure(f"{value!r:.60} is a {found}, not a {base.__name__}")
+        kind = type(value).__name__
+        raise CheckFailure(f"{value!r:.60} is a {kind}, not a {base.__name__}")
 
 
-def expect_equal(what: str, found: object, wanted: object) -> None:
+def expect_equal(what: str, actual: object, wanted: object) -> None:
     """Fail the running check unless both are equal; e.g. `what` is "masks are"."""
-    if found != wanted:
-        raise CheckFailure(f"{what} {found}, not {wanted}")
+    if actual != wanted:
+        raise CheckFailure(f"{what} {actual}, not {wanted}")
 
 
 def checks_of(suite: type[Suite]) -> tuple[Callable[[Any], None], ...]:
     """The checks of a suite: public methods without parameters, its own before inherited ones."""
-    methods = [m for each in suite.__mro__ for m in vars(each).values() if inspect.isfunction(m)]
+    methods = [m for base in suite.__mro__ for m in vars(base).values() if inspect.isfunction(m)]
     public = (m for m in methods if not m.__name__.startswith("_"))
     return tuple(m for m in public if len(inspect.signature(m).parameters) == 1)
 

@@ -104,11 +104,11 @@ def _there(field: StateField, episode: Episode) -> NDArray[np.bool_]:
 
 def _distances(fields: Sequence[StateField], episode: Episode) -> Array:
     """How different frames are in some fields, ``[T, T]``, relative to how these are spread."""
-    found = np.zeros((len(episode.video),) * 2)
+    distances = np.zeros((len(episode.video),) * 2)
     for field in fields:
         code = encode(field, np.asarray(episode.states[field.name], np.float64))
         code = code.reshape(len(code), -1)
         spread = np.sqrt(((code - code.mean(0)) ** 2).sum(1).mean())
         if spread > UNIT * np.abs(code).max(initial=0):
-            found += (((code[:, None] - code[None]) / spread) ** 2).sum(-1)
-    return np.sqrt(found)
+            distances += (((code[:, None] - code[None]) / spread) ** 2).sum(-1)
+    return np.sqrt(distances)

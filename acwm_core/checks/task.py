@@ -43,11 +43,11 @@ class TaskChecks(EnvironmentTrial):
         """The tasks by name; those of a class are not known."""
         if self.name is None:
             raise NotTried("a class has no tasks: give its registered name")
-        found = catalog().component("environment", self.name)
-        names = [name for name in found.tasks if self.only in (None, name)]
+        component = catalog().component("environment", self.name)
+        names = [name for name in component.tasks if self.only in (None, name)]
         if not names:
             raise NotTried("it has no tasks")
-        tasks = {name: found.load_task(name) for name in names}
+        tasks = {name: component.load_task(name) for name in names}
         for name, task in tasks.items():
             expect_is_a(task, Task)
             expect_equal(f"the name of task {name!r} is", task.name, name)

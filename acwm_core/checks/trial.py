@@ -219,8 +219,8 @@ class PredictionTrial(Suite):
             raise NotTried(str(error)) from None
         seen = [0, *range(known, frames - 1)]  # the first call covers all given frames
         ends, conditioning = range(known + 1, frames + 1), probed(modulation)
-        steps = [conditioning.frames(*each) for each in zip(seen, ends, strict=True)]
-        streamed = torch.cat([stream.advance(each) for each in steps], 1)
+        steps = [conditioning.frames(*span) for span in zip(seen, ends, strict=True)]
+        streamed = torch.cat([stream.advance(step) for step in steps], 1)
         wanted = [len(given), frames - known, *latents.shape[2:]]
         expect_equal("a stream gives", [*streamed.shape], wanted)
         expect(streamed.isfinite().all(), "a streamed frame is not finite")
@@ -241,10 +241,12 @@ class PredictionTrial(Suite):
         latents, modulation = self._inputs()
         seeds, samples = (0, 0, 100), self._model.samples
         expect_is_a(samples, bool)
-        made = {"prediction": [self._predict(latents[:, :1], modulation, first=s) for s in seeds]}
+        results = {
+            "prediction": [self._predict(latents[:, :1], modulation, first=s) for s in seeds]
+        }
         with contextlib.suppress(NotTried):
-            made["stream"] = [self._streamed(1, first=s) for s in seeds]
-        for what, (once, again, other) in made.items():
+            results["stream"] = [self._streamed(1, first=s) for s in seeds]
+        for what, (once, again, other) in results.items():
             expect(torch.equal(once, again), f"generators do not decide its {what}")
             same = torch.equal(once, other)
             expect(not (same and samples), f"its {what} ignores generators, but samples is true")
@@ -273,10 +275,10 @@ class DenoisingTrial(DiffusionForcing):
 def further_inputs(model: Denoiser, batch: int, frames: int, *size: int) -> dict[str, Tensor]:
     """Random further inputs of a denoiser, the same for all elements of a batch."""
     shapes = {"latent": (1, frames, *size), "level": (1, frames)}
-    drawn = {name: noise(shapes[kind], seed=6) for name, kind in model.inputs.items()}
+    inputs = {name: noise(shapes[kind], seed=6) for name, kind in model.inputs.items()}
     return {
-        name: (each.sigmoid() if each.ndim == 2 else each).expand(batch, *each.shape[1:])
-        for name, each in drawn.items()
+        name: (values.sigmoid() if values.ndim == 2 else values).expand(batch, *values.shape[1:])
+        for name, values in inputs.items()
     }
 
 
@@ -317,11 +319,11 @@ class TinyDenoiser(Denoiser):
         assert isinstance(cache, _Past)
         assert conditioning.modulation is not None
         parts = [latents, sigma[..., None], conditioning.modulation]
-        parts += [each if each.ndim == 5 else each[..., None] for each in inputs.values()]
+        parts += [part if part.ndim == 5 else part[..., None] for part in inputs.values()]
         size = latents.shape[3:]
         wide = [
-            each if each.ndim == 5 else each[..., None, None].expand(-1, -1, -1, *size)
-            for each in parts
+            part if part.ndim == 5 else part[..., None, None].expand(-1, -1, -1, *size)
+            for part in parts
         ]
         hidden = torch.tanh(self.read(torch.cat(wide, 2).movedim(2, -1)))
         return self.write(torch.cat([hidden, cache.means(hidden)], -1)).movedim(-1, 2)

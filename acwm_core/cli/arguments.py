@@ -119,10 +119,10 @@ def seed_numbers(text: str) -> tuple[int, ...]:
 
 def seeds_of(context: click.Context, option: click.Parameter, text: str) -> tuple[int, ...]:
     """Parse the seeds of episodes, of which none may be given twice."""
-    found = seed_numbers(text)
-    if not found or len({*found}) != len(found) or min(found) < 0:
+    seeds = seed_numbers(text)
+    if not seeds or len({*seeds}) != len(seeds) or min(seeds) < 0:
         raise click.BadParameter(f"{text}: give numbers of episodes, each once: 0,1,2 or 0..49")
-    return found
+    return seeds
 
 
 def split_options(

@@ -31,8 +31,8 @@ Items = list[CompletionItem]
 def components(ctx: click.Context, incomplete: str) -> Items:
     """Names of all components except commands."""
     kinds = [kind for kind in catalog().kinds if kind != "command"]
-    found = {each.name: each.summary for kind in kinds for each in catalog().registry(kind)}
-    return _starting(incomplete, found.items())
+    summaries = dict(pair for kind in kinds for pair in _named(kind))
+    return _starting(incomplete, summaries.items())
 
 
 def environments(ctx: click.Context, incomplete: str) -> Items:
@@ -87,9 +87,9 @@ def _values(ctx: click.Context, key: str) -> list[str]:
     if section not in SECTIONS:
         return []
     takes = signature(resolve_name(SECTIONS[section])).parameters
-    found = takes[parameter].type if parameter in takes else None
-    choices = get_args(found) if get_origin(found) is Literal else ()
-    return ["true", "false"] if found is bool else [str(choice) for choice in choices]
+    expected = takes[parameter].type if parameter in takes else None
+    choices = get_args(expected) if get_origin(expected) is Literal else ()
+    return ["true", "false"] if expected is bool else [str(choice) for choice in choices]
 
 
 def _recipe(ctx: click.Context) -> dict[str, Any]:
@@ -110,13 +110,13 @@ def _recipe(ctx: click.Context) -> dict[str, Any]:
 
 
 def _named(kind: str) -> list[tuple[str, str]]:
-    return [(each.name, each.summary) for each in catalog().registry(kind)]
+    return [(component.name, component.summary) for component in catalog().registry(kind)]
 
 
-def _starting(incomplete: str, found: Iterable[tuple[str, str]]) -> Items:
+def _starting(incomplete: str, summaries: Iterable[tuple[str, str]]) -> Items:
     return [
         CompletionItem(value, help=about or None)
-        for value, about in sorted(found)
+        for value, about in sorted(summaries)
         if value.startswith(incomplete)
     ]
 

@@ -48,8 +48,8 @@ def list_components(kind: str | None) -> None:
         raise unknown_name("kind", kind, [*known, "kind", "recipe"])
     if kind is None:
         console.print(_counts(), end="\n\n")
-    for each in [kind] if kind else known:
-        console.print(_table(each, with_tasks=kind == "task"), end="\n\n")
+    for name in [kind] if kind else known:
+        console.print(_table(name, with_tasks=kind == "task"), end="\n\n")
     for problem in catalog().problems:
         console.print(f"plugin {problem.plugin!r} was left out: {problem.reason}", markup=False)
 
@@ -122,7 +122,9 @@ def check(name: str, overrides: tuple[str, ...]) -> None:
     """
     kinds = [kind for kind in catalog().kinds if name in catalog().registry(kind)]
     if not kinds:
-        known = {each.name for kind in catalog().kinds for each in catalog().registry(kind)}
+        known = {
+            component.name for kind in catalog().kinds for component in catalog().registry(kind)
+        }
         raise unknown_name("component", name, known)
     suites = {kind: suite for kind in kinds if (suite := _suite(kind))}
     if not suites:

@@ -40,7 +40,7 @@ except Exception as error:
 """
 
 
-class Finding(NamedTuple):
+class Diagnosis(NamedTuple):
     """One line of the doctor's report; `works` is None if it is not installed."""
 
     what: str
@@ -67,24 +67,24 @@ def doctor() -> int:
     return int(failures > 0)
 
 
-def findings() -> Iterator[Finding]:
+def findings() -> Iterator[Diagnosis]:
     """Yield all findings of the doctor, one by one."""
     from acwm_core.executors import available_cores
     from acwm_core.plugins import catalog
 
     works = (3, 11) <= sys.version_info < (3, 14)
     advice = "" if works else "; the simulators ship wheels only for Python 3.11, 3.12 and 3.13"
-    yield Finding("Python", works, f"{platform.python_version()}{advice}")
-    yield Finding("platform", True, f"{platform.platform()}, {available_cores()} cores")
+    yield Diagnosis("Python", works, f"{platform.python_version()}{advice}")
+    yield Diagnosis("platform", True, f"{platform.platform()}, {available_cores()} cores")
     yield from map(_package, PACKAGES)
-    yield Finding("accelerator", True, _accelerator())
+    yield Diagnosis("accelerator", True, _accelerator())
     for plugin in catalog().plugins:
-        yield Finding(f"plugin {plugin}", True, "loaded")
+        yield Diagnosis(f"plugin {plugin}", True, "loaded")
     for problem in catalog().problems:
-        yield Finding(f"plugin {problem.plugin}", False, problem.reason)
+        yield Diagnosis(f"plugin {problem.plugin}", False, problem.reason)
     for component in catalog().registry("executor"):  # the cluster may be elsewhere
         note = component.needs or _versions(component) or "installed"
-        yield Finding(f"executor {component.name}", None if component.needs else True, note)
+        yield Diagnosis(f"executor {component.name}", None if component.needs else True, note)
     engines: dict[object, list[Component]] = {}  # by required packages or module
     for component in catalog().registry("environment"):
         engine = component.requires or component.target.partition(":")[0]
@@ -93,35 +93,35 @@ def findings() -> Iterator[Finding]:
         yield from pool.map(trial_of_engine, engines.values())
 
 
-def trial_of_engine(components: Sequence[Component]) -> Finding:
+def trial_of_engine(components: Sequence[Component]) -> Diagnosis:
     """Try the first of several environments that share a simulator, and name the others."""
     first, *others = components
     what, works, note = trial(first)
     names = ", ".join(other.name for other in others)
-    return Finding(what, works, f"{note}; same simulator as {names}" if names else note)
+    return Diagnosis(what, works, f"{note}; same simulator as {names}" if names else note)
 
 
-def trial(component: Component) -> Finding:
+def trial(component: Component) -> Diagnosis:
     """Start an environment and take a step, in its own process as a bad library may crash it."""
     what = f"environment {component.name}"
     if component.needs:
-        return Finding(what, None, component.needs)
+        return Diagnosis(what, None, component.needs)
     engine = _versions(component)
     try:
         command = [sys.executable, "-P", "-c", _TRIAL, component.name]
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=TRIAL_SECONDS)
     except subprocess.TimeoutExpired:
-        return Finding(what, False, f"no frame after {TRIAL_SECONDS} s ({engine})")
+        return Diagnosis(what, False, f"no frame after {TRIAL_SECONDS} s ({engine})")
     except subprocess.CalledProcessError as error:
-        return Finding(what, False, _reason(error.stderr) or f"exit code {error.returncode}")
-    return Finding(what, True, f"simulates and renders ({engine})" if engine else "simulates")
+        return Diagnosis(what, False, _reason(error.stderr) or f"exit code {error.returncode}")
+    return Diagnosis(what, True, f"simulates and renders ({engine})" if engine else "simulates")
 
 
-def _package(name: str) -> Finding:
+def _package(name: str) -> Diagnosis:
     try:
-        return Finding(name, True, importlib.metadata.version(name))
+        return Diagnosis(name, True, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, False, f"not installed: pip install {name}")
+        return Diagnosis(name, False, f"not installed: pip install {name}")
 
 
 def _versions(component: Component) -> str:

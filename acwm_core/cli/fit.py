@@ -46,8 +46,8 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     the end, model.safetensors.
     """
     words = [recipe, *overrides]
-    resumed = [each for each in words if each.startswith("resume=")]
-    words = [each for each in words if each not in resumed]
+    resumed = [word for word in words if word.startswith("resume=")]
+    words = [word for word in words if word not in resumed]
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume in (None, "auto"):
         composed, run = _recipe_to_start(words, out)
@@ -75,7 +75,7 @@ def _recipe_to_start(words: Sequence[str], out: Path | None) -> tuple[Recipe, Pa
     if not words:
         raise RecipeError("resume=auto needs the recipe, too; resume=RUN takes it from the run")
     name, *overrides = words
-    overlays = "".join(each for each in overrides if each.startswith("+"))
+    overlays = "".join(override for override in overrides if override.startswith("+"))
     return compose(name, overrides), out or Path("runs", Path(name).stem + overlays)
 
 

@@ -82,8 +82,8 @@ def generate(
     card = generate_dataset(
         environment, out, episodes=counts, factors=factors, executor=chosen, **others_of_data
     )
-    made = ", ".join(f"{count} {name}" for name, count in card.splits.items())
-    click.echo(f"{out} holds {made} episodes of {environment}")
+    splits = ", ".join(f"{count} {name}" for name, count in card.splits.items())
+    click.echo(f"{out} holds {splits} episodes of {environment}")
 
 
 def _factors(overrides: Sequence[str]) -> dict[str, FactorSetting]:

@@ -37,18 +37,19 @@ class AcwmGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Commands in the order of a typical workflow, then commands of plugins without a place."""
         brought = catalog().registry("command")
-        after = {n: str(each.defaults.get("after")) for n, each in brought.components().items()}
+        commands = brought.components().items()
+        after = {name: str(command.defaults.get("after")) for name, command in commands}
         opening = [name for name, place in after.items() if place == "acwm"]
-        whole = (each.name for each in brought if "." not in each.name)
+        whole = (command.name for command in brought if "." not in command.name)
         names = dict.fromkeys([*opening, *self.commands, *whole])
 
         def followed(name: str) -> Iterator[str]:
             yield name
-            for other in reversed([each for each, place in after.items() if place == name]):
+            for other in reversed([other for other, place in after.items() if place == name]):
                 yield from followed(other)
 
         first = [name for name in names if after.get(name) not in names]
-        placed = [each for name in first for each in followed(name)]
+        placed = [follower for name in first for follower in followed(name)]
         return list(dict.fromkeys([*placed, *names]))  # `names` adds those that form a circle
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -56,13 +57,13 @@ class AcwmGroup(click.Group):
 
         A plugin adds to a group of another one by a name such as ``"data.report"``.
         """
-        found, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
-        command = brought[cmd_name].load() if found is None and cmd_name in brought else found
+        own, brought = super().get_command(ctx, cmd_name), catalog().registry("command")
+        command = brought[cmd_name].load() if own is None and cmd_name in brought else own
         if isinstance(command, click.Group):
-            for each in brought:
-                group, _, name = each.name.partition(".")
+            for component in brought:
+                group, _, name = component.name.partition(".")
                 if name and group == cmd_name:
-                    command.add_command(each.load(), name)
+                    command.add_command(component.load(), name)
         if command and ctx.resilient_parsing:  # shell completion
             from acwm_core.cli.completion import COMPLETIONS
 
@@ -84,7 +85,7 @@ class AcwmGroup(click.Group):
         warnings.showwarning = _show_warning
         _print_anything()
         words = list(sys.argv[1:] if args is None else args)
-        shown = "--traceback" in words
+        with_traceback = "--traceback" in words
         trust_recipes("--trust-recipe" in words)
         words = [word for word in words if word not in ("--traceback", "--trust-recipe")]
         try:
@@ -100,10 +101,10 @@ class AcwmGroup(click.Group):
             _fail(error.format_message(), error.exit_code)
         except (KeyboardInterrupt, click.Abort) as stop:
             if isinstance(stop.__cause__, EOFError):  # click takes it for the end of the input
-                _report(stop.__cause__, shown)
+                _report(stop.__cause__, with_traceback)
             _fail("stopped", INTERRUPTED)
         except Exception as error:
-            _report(error, shown)
+            _report(error, with_traceback)
         sys.exit(result if isinstance(result, int) else 0)
 
 
@@ -122,11 +123,11 @@ def _report(error: Exception, with_traceback: bool) -> NoReturn:
     if with_traceback:
         traceback.print_exception(error)
     _refuse_a_deleted_folder()
-    found = None if isinstance(error, AcwmError) else disk_error(error)
-    if found is not None:
-        where = f"{found.filename}: " if found.filename else ""
+    cause = None if isinstance(error, AcwmError) else disk_error(error)
+    if cause is not None:
+        where = f"{cause.filename}: " if cause.filename else ""
         advice = "free disk space or fix the permissions, and run the command again"
-        _fail(f"{where}{found.strerror}; {advice}", 2)
+        _fail(f"{where}{cause.strerror}; {advice}", 2)
     if isinstance(error, AcwmError):
         _fail(sentence(error), error.exit_code)
     if not is_for_users(error):

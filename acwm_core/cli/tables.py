@@ -41,11 +41,11 @@ def print_table(
     from rich.measure import Measurement
 
     def table(columns: Sequence[int], title: str | None) -> Table:
-        made = plain_table(title, "", [numbers[column] for column in columns])
-        made.columns[0].no_wrap, made.columns[0].overflow = False, "fold"  # a name is never cut
+        grid = plain_table(title, "", [numbers[column] for column in columns])
+        grid.columns[0].no_wrap, grid.columns[0].overflow = False, "fold"  # a name is never cut
         for name, cells in rows:
-            made.add_row(name, *(cells[column] for column in columns))
-        return made
+            grid.add_row(name, *(cells[column] for column in columns))
+        return grid
 
     left, unbounded = list(range(len(numbers))), console.options.update(max_width=10_000)
     while left:

@@ -87,7 +87,7 @@ class DatasetCard:
         factors = "".join(f" {shlex.quote(word)}" for word in words)
         exploration = f" --exploration {self.exploration}" if self.exploration else ""
         exploration += f" --shift {self.shift}" if self.shift else ""
-        counts = ",".join(str(self.splits.get(each, 0)) for each in SPLITS)
+        counts = ",".join(str(self.splits.get(split, 0)) for split in SPLITS)
         which = f"--episodes {counts}" if split == "all" else f"--split {split}"
         height, width = self.environment.frame_size
         return (
@@ -202,19 +202,19 @@ class DatasetCard:
             how = {True: "recorded", False: "simulated"}
             return [f"it was {how[bool(self.source)]} there, is {how[bool(other.source)]} now"]
         there, now = _recipe(self), _recipe(other)
-        found: list[str] = []
+        changes: list[str] = []
         for name in sorted({**there, **now}):
             before, after = there.get(name, "not set"), now.get(name, "not set")
             only_one = name not in there or name not in now
             if before != after and not (name.startswith("splits.") and only_one):
-                found.append(f"{name} is {before} there, {after} now")
-        return found
+                changes.append(f"{name} is {before} there, {after} now")
+        return changes
 
     def has_data_of(self, other: DatasetCard) -> bool:
         """Whether both datasets have the same training episodes, wherever these come from."""
         ours, theirs = self.checksums.get("train"), other.checksums.get("train")
         if ours and ours == theirs:
-            ours, theirs = (_recipe(each, "environment") for each in (self, other))
+            ours, theirs = (_recipe(card, "environment") for card in (self, other))
             return ours == theirs
         # A simulation that is repeated on another machine may differ in its last bits.
         is_repeated = not (self.source and ours and theirs)

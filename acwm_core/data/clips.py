@@ -159,10 +159,10 @@ def common_length(lengths: NDArray[np.int64], indices: Sequence[int]) -> int:
     Raises:
         ValueError: their lengths differ, so they cannot form a batch.
     """
-    found = lengths[np.asarray(indices)]
-    if (found != found[0]).any():
-        raise ValueError(f"a batch cannot hold clips of {sorted(set(found.tolist()))} frames")
-    return int(found[0])
+    chosen = lengths[np.asarray(indices)]
+    if (chosen != chosen[0]).any():
+        raise ValueError(f"a batch cannot hold clips of {sorted(set(chosen.tolist()))} frames")
+    return int(chosen[0])
 
 
 def hold_out(episodes: int, validation: int | None) -> tuple[range, range]:

@@ -91,8 +91,8 @@ def generate(
     out, executor = Path(out), executor or LocalExecutor(workers)
     component = catalog().component("environment", environment)
     options = {} if size is None else {"size": size}
-    with contextlib.closing(make_environment(component, options)) as made:
-        card = made.card
+    with contextlib.closing(make_environment(component, options)) as simulator:
+        card = simulator.card
     for split, count in episodes.items():
         if split not in SPLITS:
             raise RecipeError(f"unknown split {split!r}{suggest(split, SPLITS)}")
@@ -195,8 +195,8 @@ def _existing_shard(path: Path, specs: Sequence[EpisodeSpec]) -> ShardRecord | N
     """The record of the shard at `path` if it is complete and holds the episodes of `specs`."""
     with contextlib.suppress(DataError):
         reader = open_shard(path)
-        made = [reader.about(position)["spec"] for position in range(len(reader))]
-        if made == json.loads(json.dumps([spec.to_dict() for spec in specs])):
+        specs_of_shard = [reader.about(position)["spec"] for position in range(len(reader))]
+        if specs_of_shard == json.loads(json.dumps([spec.to_dict() for spec in specs])):
             return ShardRecord.of_file(path, specs[0].index)
     return None
 
@@ -225,7 +225,9 @@ def fill(
         remove_partial(out)
         there = DatasetCard.read(out) if (out / CARD).exists() else wanted
         differences = there.differences(wanted)
-        if others := [each for each in differences if not each.startswith("versions.")]:
+        if others := [
+            difference for difference in differences if not difference.startswith("versions.")
+        ]:
             raise other_dataset(out, others)
         for split in wanted.splits:
             remove_partial(out / split)

@@ -85,7 +85,7 @@ class LatentFolder:
         name = Path(LATENTS, str(self.fingerprint), windows)
         beside = episodes.path / name
         shards = range(len(episodes.shards))
-        if is_writable(beside) or all((beside / shard_name(each)).exists() for each in shards):
+        if is_writable(beside) or all((beside / shard_name(shard)).exists() for shard in shards):
             return beside
         return cache_folder() / name
 

@@ -70,6 +70,6 @@ def strip(
     videos: Sequence[Picture], columns: int = 8, *, gap: int = 0, colour: Sequence[int] = (255,)
 ) -> Picture:
     """A picture of the `moments` of videos of equal length, with one row per video."""
-    shown = moments(len(videos[0]), columns)
-    rows = [join([video[t] for t in shown], gap=gap, colour=colour) for video in videos]
+    times = moments(len(videos[0]), columns)
+    rows = [join([video[t] for t in times], gap=gap, colour=colour) for video in videos]
     return join(rows, down=True, gap=gap, colour=colour)

@@ -129,8 +129,8 @@ def fetch(url: str, path: Path, sha256: str | None = None) -> None:
 
 def located(url: str) -> tuple[Any, str]:
     """The fsspec file system of `url`, and the name of the file in it."""
-    found = URL.match(url)
-    protocol = found.group(1).lower() if found else ""
+    match = URL.match(url)
+    protocol = match.group(1).lower() if match else ""
     if protocol not in PROTOCOLS or "://" not in url or "::" in url:
         known = ", ".join(f"{name}://" for name in PROTOCOLS)
         raise DataError(f"{url} is not a supported address; URLs begin with {known}")

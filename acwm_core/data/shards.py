@@ -73,7 +73,7 @@ class ActionSums:
         """The sums over the actions ``[T, A]`` of some episodes, in float64."""
         actions = np.concatenate([rows[:-1] for rows in episodes]).astype(np.float64)
         sums = actions.sum(0), (actions**2).sum(0), actions.min(0), actions.max(0)
-        return cls(len(actions), *(each.tolist() for each in sums))
+        return cls(len(actions), *(total.tolist() for total in sums))
 
 
 @dataclass(frozen=True)
@@ -174,8 +174,8 @@ def write_shard(
         with TarWriter(
             cast(Any, file), encoder=False, user="", group="", mode=0o644, mtime=0
         ) as tar:
-            for each in episodes:
-                episode = each if isinstance(each, Packed) else pack(each, fps, versions)
+            for given in episodes:
+                episode = given if isinstance(given, Packed) else pack(given, fps, versions)
                 key = f"{episode.spec.split}-{episode.spec.index:06d}"
                 for name, data in episode.members.items():
                     tar.write({"__key__": key, name: data})  # one by one, to keep their order

@@ -34,13 +34,13 @@ def make_environment(
     component = environment
     if isinstance(component, str):
         component = catalog().component("environment", component)
-    made = component.create_as(Environment, **(options or {}))
-    if made.card.name != component.name:
+    instance = component.create_as(Environment, **(options or {}))
+    if instance.card.name != component.name:
         raise PluginError(
-            f"environment {component.name!r} has a card with the name {made.card.name!r}: data "
+            f"environment {component.name!r} has a card with the name {instance.card.name!r}: data "
             "carries the name of the card, so give the card the registered name"
         )
-    return made
+    return instance
 
 
 def simulate(

@@ -57,7 +57,7 @@ class ClipStream(torch_data.IterableDataset[Any]):
     ) -> None:
         self.clips, self.sampler, self.shuffle_buffer = clips, sampler, shuffle_buffer
         episodes: list[int] = clips.windows[:, 0].tolist()
-        self._shard_of = np.array([clips.episodes.shard_of(each) for each in episodes])
+        self._shard_of = np.array([clips.episodes.shard_of(episode) for episode in episodes])
         self._pending: dict[int, list[dict[str, Tensor]]] = defaultdict(list)  # by clip length
 
     def __iter__(self) -> Iterator[Any]:

@@ -140,7 +140,7 @@ class EnvironmentCard:
                     f"the symmetry {symmetry.name!r} of {self.name} takes "
                     f"{len(symmetry.actions)} actions, not {self.action.size}"
                 )
-        kept = tuple(each for each in self.symmetries if each.keeps(self.frame_size))
+        kept = tuple(symmetry for symmetry in self.symmetries if symmetry.keeps(self.frame_size))
         object.__setattr__(self, "symmetries", kept)
 
     @property
@@ -155,7 +155,7 @@ class EnvironmentCard:
     @property
     def fields(self) -> dict[str, StateField]:
         """The fields of the state by their names."""
-        return {each.name: each for each in self.state}
+        return {field.name: field for field in self.state}
 
     @property
     def recorded(self) -> EnvironmentCard:
@@ -168,7 +168,7 @@ class EnvironmentCard:
 
         Both are cards of the same recorded data.
         """
-        own = {each.name: each for each in self.recorded.state}
+        own = {field.name: field for field in self.recorded.state}
         fields = other.fields
         state = (fields.get(f.name, f) if f == own[f.name] else f for f in self.state)
         return replace(
@@ -182,9 +182,9 @@ class EnvironmentCard:
     def contradictions(self, other: EnvironmentCard) -> list[str]:
         """What both cards say of the scene, and not alike, e.g. ``["camera", "state yaw"]``."""
         mine, theirs = self.completed_by(other), other.completed_by(self)
-        found = [name for name in SCENE if getattr(mine, name) != getattr(theirs, name)]
+        differences = [name for name in SCENE if getattr(mine, name) != getattr(theirs, name)]
         pairs = zip(mine.state, theirs.state, strict=False)
-        return found + [f"state {a.name}" for a, b in pairs if a != b and a.name == b.name]
+        return differences + [f"state {a.name}" for a, b in pairs if a != b and a.name == b.name]
 
     def transformed(self, symmetry: Symmetry, name: str, values: NDArray[Any]) -> NDArray[Any]:
         """The values `[T, …]` of a state field after a symmetry: as that says, or as the kind does.
@@ -206,7 +206,7 @@ class EnvironmentCard:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict, the inverse of `from_dict`."""
-        values = {**asdict(self), "state": [each.to_dict() for each in self.state]}
+        values = {**asdict(self), "state": [field.to_dict() for field in self.state]}
         newer = {name for name in ("views", "symmetries", *SCENE) if not values[name]}
         return {name: value for name, value in values.items() if name not in newer}
 
@@ -273,14 +273,14 @@ def meaning_differences(
         order = " in this order" if sorted(a.names) == sorted(b.names) else ""
         pairs.append((f"the actions {', '.join(a.names)}{order}", ", ".join(b.names)))
     elif a.units != b.units:
-        each = zip(a.names, a.units, b.units, strict=True)
-        found = [
-            (f"{n} in {u or 'no unit'}", f"{n} in {v or 'no unit'}") for n, u, v in each if u != v
+        axes = zip(a.names, a.units, b.units, strict=True)
+        changes = [
+            (f"{n} in {u or 'no unit'}", f"{n} in {v or 'no unit'}") for n, u, v in axes if u != v
         ]
-        pairs.append((", ".join(f for f, _ in found), ", ".join(f for _, f in found)))
+        pairs.append((", ".join(f for f, _ in changes), ", ".join(f for _, f in changes)))
     if a.kind != b.kind:
         pairs.append((f"actions of the kind {a.kind}", f"the kind {b.kind}"))
-    return [each for each, _ in pairs], [each for _, each in pairs]
+    return [side for side, _ in pairs], [side for _, side in pairs]
 
 
 def check_episode(episode: Episode, card: EnvironmentCard) -> None:

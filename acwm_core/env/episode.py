@@ -257,12 +257,12 @@ def draw_factors(
             raise RecipeError(f"{spec.environment} has no factor {name!r}{suggest(name, names)}")
     shifts = ood_shifts if spec.split == "ood_test" else ()
     shifted = shifts[spec.index % len(shifts)] if shifts else ""
-    drawn: dict[str, FactorValue] = {}
+    values: dict[str, FactorValue] = {}
     for factor in factors:
         usual = "ood" if factor.name == shifted else "train" if factor.active else "nominal"
         setting = spec.factors.get(factor.name, usual)
-        drawn[factor.name] = factor.draw(setting, spec.rng(f"factor:{factor.name}"))
-    return drawn
+        values[factor.name] = factor.draw(setting, spec.rng(f"factor:{factor.name}"))
+    return values
 
 
 def ood_label(factors: tuple[Factor, ...], values: Mapping[str, FactorValue]) -> str | None:

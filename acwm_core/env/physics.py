@@ -95,7 +95,7 @@ def readings_of(state: Iterable[StateField], *names: str) -> tuple[Reading, ...]
     Raises:
         ShapeError: a field is not there, or has nothing that can be read.
     """
-    fields, readings = {each.name: each for each in state}, list[Reading]()
+    fields, readings = {field.name: field for field in state}, list[Reading]()
     for name in names:
         field, kinds = fields.get(name), get_args(ReadingKind)
         parts = [part for part in field.parts if part.kind in kinds] if field else []
@@ -206,7 +206,7 @@ class Physics:
     @property
     def fields(self) -> dict[str, StateField]:
         """The fields of the card by their names."""
-        return {each.name: each for each in self.state}
+        return {field.name: field for field in self.state}
 
     @property
     def positions(self) -> list[Reading]:
@@ -273,7 +273,7 @@ class StateEstimator(ABC):
             owner = type(self).__name__
             raise PluginError(f"{owner}.estimate gives no Observation of {', '.join(self.fields)}")
         check_shape(self, "estimate (masks)", seen.masks, frames, *size)
-        for field in (each for each in self.card.state if each.name in self.fields):
+        for field in (declared for declared in self.card.state if declared.name in self.fields):
             method = f"estimate ({field.name})"
             check_shape(self, method, seen.states[field.name], frames, *field.shape)
             if np.isinf(seen.states[field.name]).any():

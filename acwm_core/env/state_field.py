@@ -141,7 +141,9 @@ class StateField:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready dict without what is as by default."""
-        values = {each.name: (getattr(self, each.name), each.default) for each in fields(self)}
+        values = {
+            option.name: (getattr(self, option.name), option.default) for option in fields(self)
+        }
         return {
             k: value for k, (value, usual) in values.items() if usual is MISSING or value != usual
         }
@@ -174,7 +176,7 @@ class StateField:
                 yield f"has entries of the kind {kind!r}, which only a field of its own can be"
 
     def _problems_of_options(self) -> Iterable[str]:
-        allowed = {each for kind in self.kinds for each in SYMMETRIES.get(kind, ("none",))}
+        allowed = {symmetry for kind in self.kinds for symmetry in SYMMETRIES.get(kind, ("none",))}
         if self.symmetry not in allowed:
             yield (
                 f"has the symmetry {self.symmetry!r}, which no {' or '.join(self.kinds)} has: "
@@ -202,26 +204,26 @@ def check_scene(state: Sequence[StateField], instances: Sequence[str]) -> None:
     Raises:
         ShapeError: one names another.
     """
-    by_name = {each.name: each for each in state}
-    for each in state:
-        who = f"the state field {each.name!r}"
-        for name in (each.present, *each.follows):
+    by_name = {field.name: field for field in state}
+    for field in state:
+        who = f"the state field {field.name!r}"
+        for name in (field.present, *field.follows):
             if name and name not in by_name:
                 raise ShapeError(f"{who} refers to {name!r}, which is not a field of the state")
-        for name in each.instances:
+        for name in field.instances:
             if name not in instances:
                 raise ShapeError(
                     f"{who} belongs to {name!r}, which is not an instance: choose "
                     f"one of {', '.join(instances)}"
                 )
-        if each.present:
-            present = by_name[each.present]
-            if present.kind != "presence" or present.rows != each.rows:
+        if field.present:
+            present = by_name[field.present]
+            if present.kind != "presence" or present.rows != field.rows:
                 raise ShapeError(
-                    f"{who} has {each.rows} rows, which exist where {each.present!r} is 1: declare "
-                    f"that one as a presence of shape [{each.rows}]"
+                    f"{who} has {field.rows} rows, which exist where {field.present!r} is 1: "
+                    f"declare that one as a presence of shape [{field.rows}]"
                 )
-        _check_sources(each, by_name)
+        _check_sources(field, by_name)
 
 
 def without_dangling(
@@ -229,15 +231,15 @@ def without_dangling(
 ) -> tuple[StateField, ...]:
     """Some fields of a card without what they say of others and of instances that are not kept."""
     kept = list(state)
-    names = {each.name for each in kept}
+    names = {field.name for field in kept}
     return tuple(
         replace(
-            each,
-            instances=each.instances if set(each.instances) <= set(instances) else (),
-            present=each.present if each.present in names else "",
-            follows=each.follows if set(each.follows) <= names else (),
+            field,
+            instances=field.instances if set(field.instances) <= set(instances) else (),
+            present=field.present if field.present in names else "",
+            follows=field.follows if set(field.follows) <= names else (),
         )
-        for each in kept
+        for field in kept
     )
 
 

@@ -146,18 +146,18 @@ def group(*generators: Symmetry) -> tuple[Symmetry, ...]:
     Raises:
         ShapeError: two of them transform frames alike, but not actions or states.
     """
-    found: dict[str, Symmetry] = {}
+    by_name: dict[str, Symmetry] = {}
     new = list(generators)
     while new:
-        for each in new:
-            if found.setdefault(each.name, each) != each:
+        for symmetry in new:
+            if by_name.setdefault(symmetry.name, symmetry) != symmetry:
                 raise ShapeError(
-                    f"there are two symmetries {each.name!r}: they do not form a group"
+                    f"there are two symmetries {symmetry.name!r}: they do not form a group"
                 )
-        pairs = itertools.product(list(found.values()), repeat=2)
+        pairs = itertools.product(list(by_name.values()), repeat=2)
         products = [both for second, first in pairs if (both := second.after(first)) is not None]
-        new = [each for each in products if found.get(each.name) != each]
-    return tuple(found[name] for name in sorted(found))
+        new = [symmetry for symmetry in products if by_name.get(symmetry.name) != symmetry]
+    return tuple(by_name[name] for name in sorted(by_name))
 
 
 def _joined(second: Axes, first: Axes) -> Axes:

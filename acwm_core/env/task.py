@@ -120,9 +120,9 @@ def judged(task: Task, method: str, seen: Observation, goal: Goal) -> NDArray[An
     Raises:
         PluginError: the result is not one value per frame.
     """
-    found = np.asarray(getattr(task, method)(seen, goal))
-    check_shape(task, method, found, len(seen.masks))
-    return found
+    values = np.asarray(getattr(task, method)(seen, goal))
+    check_shape(task, method, values, len(seen.masks))
+    return values
 
 
 class TaskEnvironment(gymnasium.Wrapper[Frame, NDArray[np.float32], Frame, NDArray[np.float32]]):

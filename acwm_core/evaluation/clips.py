@@ -97,17 +97,17 @@ def sound_clips(
     """
     split = episodes.split
     chosen = protocol_named(config.protocol).episodes(len(episodes), config.episodes)
-    damage = {each: why for each in chosen if (why := episodes.damage(each))}
+    damage = {episode: why for episode in chosen if (why := episodes.damage(episode))}
     if damage:
         first, why = next(iter(damage.items()))
-        told = f"{len(damage)} of {len(chosen)} episodes of {split} cannot be read"
+        unreadable = f"{len(damage)} of {len(chosen)} episodes of {split} cannot be read"
         if len(chosen) - len(damage) < 2:
-            raise DataError(f"{told}, and evaluation needs two; {why}")
+            raise DataError(f"{unreadable}, and evaluation needs two; {why}")
         warnings.warn(
-            f"{told} and are left out, e.g. episode {first}: {why}", AcwmWarning, stacklevel=2
+            f"{unreadable} and are left out, e.g. episode {first}: {why}", AcwmWarning, stacklevel=2
         )
     clips = plan_clips(split, episodes.lengths, config, given, without=damage)
-    return clips, {f"episode {each} of {split}": why for each, why in damage.items()}
+    return clips, {f"episode {episode} of {split}": why for episode, why in damage.items()}
 
 
 def plan_clips(
@@ -128,7 +128,9 @@ def plan_clips(
     """
     protocol = protocol_named(config.protocol)
     chosen = [
-        each for each in protocol.episodes(len(lengths), config.episodes) if each not in without
+        episode
+        for episode in protocol.episodes(len(lengths), config.episodes)
+        if episode not in without
     ]
     if len(chosen) < 2:
         raise DataError(
@@ -182,7 +184,7 @@ def noise_seed(seed: int, split: str, episode: int, start: int = 0) -> int:
 def draw_seeds(seed: int, draws: int) -> list[int]:
     """The seeds of several draws of a clip; the first is the clip's own seed."""
     more = (np.random.SeedSequence([seed, draw]) for draw in range(1, draws))
-    return [seed, *(int(each.generate_state(1)[0]) for each in more)]
+    return [seed, *(int(sequence.generate_state(1)[0]) for sequence in more)]
 
 
 def read_clips(clips: Iterable[Clip], episodes: EpisodeDataset) -> Iterator[tuple[Clip, Episode]]:

@@ -48,8 +48,8 @@ def score_draws(draws: Sequence[Prediction], metrics: Metrics) -> list[Score]:
         curves={**one.curves, **together.curves},
         shares={**one.shares, **together.shares},
     )
-    kinds, found = (draws[0].kind, *DRAWN), (one, mean, best_score(scores, metrics))
-    return [replace(each, kind=kind) for each, kind in zip(found, kinds, strict=True)]
+    kinds, rows = (draws[0].kind, *DRAWN), (one, mean, best_score(scores, metrics))
+    return [replace(row, kind=kind) for row, kind in zip(rows, kinds, strict=True)]
 
 
 def mean_score(scores: Sequence[Score], metrics: Metrics) -> Score:
@@ -57,20 +57,20 @@ def mean_score(scores: Sequence[Score], metrics: Metrics) -> Score:
     first = scores[0]
     if len(scores) == 1:
         return first
-    weights = {name: np.array([each.weights[name] for each in scores]) for name in metrics}
-    values = {name: np.array([each.values[name] for each in scores]) for name in metrics}
-    curves = {name: np.array([each.curves[name] for each in scores]) for name in metrics}
-    shares = {name: np.array([each.shares[name] for each in scores]) for name in first.shares}
+    weights = {name: np.array([score.weights[name] for score in scores]) for name in metrics}
+    values = {name: np.array([score.values[name] for score in scores]) for name in metrics}
+    curves = {name: np.array([score.curves[name] for score in scores]) for name in metrics}
+    shares = {name: np.array([score.shares[name] for score in scores]) for name in first.shares}
     return replace(
         first,
         values={name: _summed_up(m, values[name], weights[name]) for name, m in metrics.items()},
-        weights={name: float(each.mean()) for name, each in weights.items()},
+        weights={name: float(clip_weights.mean()) for name, clip_weights in weights.items()},
         curves={
             name: [_summed_up(metric, frame, weights[name]) for frame in curves[name].T]
             for name, metric in metrics.items()
         },
-        shares={name: mean_of_defined(each) for name, each in shares.items()},
-        failed=any(each.failed for each in scores),
+        shares={name: mean_of_defined(clip_shares) for name, clip_shares in shares.items()},
+        failed=any(score.failed for score in scores),
     )
 
 
@@ -84,18 +84,18 @@ def best_score(scores: Sequence[Score], metrics: Metrics) -> Score:
     chosen = {name: scores[_best(scores, name, metric)] for name, metric in metrics.items()}
     return replace(
         scores[0],
-        values={name: each.values[name] for name, each in chosen.items()},
-        weights={name: each.weights[name] for name, each in chosen.items()},
-        curves={name: each.curves[name] for name, each in chosen.items()},
-        shares={name: each.shares[name] for name, each in chosen.items() if name in each.shares},
+        values={name: score.values[name] for name, score in chosen.items()},
+        weights={name: score.weights[name] for name, score in chosen.items()},
+        curves={name: score.curves[name] for name, score in chosen.items()},
+        shares={name: score.shares[name] for name, score in chosen.items() if name in score.shares},
         features=scores[0].features if len(scores) == 1 else {},
-        failed=all(each.failed for each in scores),
+        failed=all(score.failed for score in scores),
     )
 
 
 def _best(scores: Sequence[Score], name: str, metric: Metric) -> int:
     sign = -1 if metric.higher_is_better else 1
-    values = np.array([sign * each.values[name] for each in scores])
+    values = np.array([sign * score.values[name] for score in scores])
     return 0 if np.isnan(values).all() else int(np.nanargmin(values))
 
 

@@ -28,7 +28,7 @@ from acwm_core.evaluation.clips import PREDICTORS, Predictor, sound_clips
 from acwm_core.evaluation.config import EvaluationConfig
 from acwm_core.evaluation.draws import metrics_for
 from acwm_core.evaluation.predict import Evaluator, VideoModel
-from acwm_core.evaluation.protocol import Published, published_for
+from acwm_core.evaluation.protocol import PublishedComparison, published_for
 from acwm_core.evaluation.provenance import provenance, run_facts
 from acwm_core.evaluation.references import scores_with_references
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score, Summary, unfinished
@@ -42,7 +42,7 @@ from acwm_core.evaluation.storage import (
 )
 from acwm_core.evaluation.study import Findings, Study
 from acwm_core.evaluation.summarise import gap, summarise_split
-from acwm_core.evaluation.videos import REPORT_PANEL, ShownClip
+from acwm_core.evaluation.videos import REPORT_PANEL, ClipVideo
 from acwm_core.evaluation.views import metrics_of_views
 from acwm_core.files import held, writing, written_whole
 from acwm_core.model.shapes import float32_by_default
@@ -67,7 +67,7 @@ class Entrant:
 
     parts: dict[str, str]
     facts: dict[str, Any]
-    published: Published | None = None
+    published: PublishedComparison | None = None
     secret: bool = False
 
 
@@ -131,7 +131,7 @@ def evaluate_clips(
     """
     with held(home):
         if not overwrite:
-            checksums = {split: each.checksum for split, each in datasets.items()}
+            checksums = {split: episodes.checksum for split, episodes in datasets.items()}
             refuse_other_result(home / SUMMARY, evaluator.config, checksums, OF_SWEEPS)
         return _evaluate(evaluator, datasets, home, entrant, progress, studies)
 
@@ -157,18 +157,20 @@ def _evaluate(
     studies: Sequence[Study],
 ) -> Summary:
     started, config = time.monotonic(), evaluator.config
-    planned = {s: sound_clips(each, config, evaluator.given) for s, each in datasets.items()}
-    clips = {split: each for split, (each, _) in planned.items()}
-    total = sum(evaluator.count_rows(each) for each in clips.values())
+    planned = {
+        s: sound_clips(episodes, config, evaluator.given) for s, episodes in datasets.items()
+    }
+    clips = {split: sound for split, (sound, _) in planned.items()}
+    total = sum(evaluator.count_rows(sound) for sound in clips.values())
     total += sum(study.count_rows(evaluator, clips) for study in studies)
-    with progress_bar(evaluator, total, progress) as shown:
-        scores = {s: scores_with_references(shown, clips[s], datasets[s]) for s in datasets}
-        sweeps = {s: shown.sweep(clips[s], datasets[s]) for s in datasets}
-        findings = [study.run(shown, clips, datasets) for study in studies]
+    with progress_bar(evaluator, total, progress) as counting:
+        scores = {s: scores_with_references(counting, clips[s], datasets[s]) for s in datasets}
+        sweeps = {s: counting.sweep(clips[s], datasets[s]) for s in datasets}
+        findings = [study.run(counting, clips, datasets) for study in studies]
     videos = [v for s in datasets for v in evaluator.videos(clips[s], datasets[s], scores[s])]
-    for each in findings:
-        videos += each.videos
-        scores = {split: [*rows, *each.scores.get(split, ())] for split, rows in scores.items()}
+    for finding in findings:
+        videos += finding.videos
+        scores = {split: [*rows, *finding.scores.get(split, ())] for split, rows in scores.items()}
     summary = _summarise(home, entrant, evaluator, scores, sweeps, findings)
     summary.videos.extend(record for record, _ in videos)
     for _, damaged in planned.values():
@@ -276,19 +278,19 @@ def check_environment(dataset: EpisodeDataset, card: EnvironmentCard) -> None:
     Raises:
         DataError: it has others.
     """
-    found = dataset.card.environment
-    if found.views and card.views and found.views != card.views:
+    own = dataset.card.environment
+    if own.views and card.views and own.views != card.views:
         raise DataError(
-            f"{dataset.path} shows the views {', '.join(found.views)}, but the run was trained on "
+            f"{dataset.path} shows the views {', '.join(own.views)}, but the run was trained on "
             f"{', '.join(card.views)}: import it with the same --camera, in the same order"
         )
-    ours, theirs = meaning_differences(found, card)
-    if not ours and not dataset.card.source and found.action != card.action:
+    ours, theirs = meaning_differences(own, card)
+    if not ours and not dataset.card.source and own.action != card.action:
         ours, theirs = ["other bounds of the actions"], ["its own"]
     if ours:
         rate = "resample it (--fps), or " if "frames/s" in ours[0] and dataset.card.source else ""
         raise DataError(
-            f"{dataset.path} holds {found.name} with {', '.join(ours)}, but the run was trained on "
+            f"{dataset.path} holds {own.name} with {', '.join(ours)}, but the run was trained on "
             f"{card.name} with {', '.join(theirs)}: {rate}give data of the same environment"
         )
     _report_range(dataset, card)
@@ -338,8 +340,8 @@ def _summarise(
     metrics, config, card = evaluator.metrics, evaluator.config, evaluator.card
     inside, outside = scores.get("ind_test"), scores.get("ood_test")
     splits = {
-        split: summarise_split(each, metrics, config.seed, sweeps[split])
-        for split, each in scores.items()
+        split: summarise_split(rows, metrics, config.seed, sweeps[split])
+        for split, rows in scores.items()
     }
     summary = Summary(
         run=home.resolve().parent.name,
@@ -357,10 +359,10 @@ def _summarise(
         left_out={**evaluator.left_out},
         published=entrant.published,
     )
-    for each in findings:
-        splits = {s: replace(own, **each.splits.get(s, {})) for s, own in summary.splits.items()}
-        summary = replace(summary, splits=splits, **each.summary)
-        summary.left_out.update(each.left_out)
+    for finding in findings:
+        splits = {s: replace(own, **finding.splits.get(s, {})) for s, own in summary.splits.items()}
+        summary = replace(summary, splits=splits, **finding.summary)
+        summary.left_out.update(finding.left_out)
     return summary
 
 
@@ -368,7 +370,7 @@ def _write(
     folder: Path,
     summary: Summary,
     scores: Mapping[str, list[Score]],
-    videos: Sequence[ShownClip],
+    videos: Sequence[ClipVideo],
 ) -> None:
     height = summary.provenance["dataset"]["frame_size"][0]
     with writing(folder), replacing_result(folder) as new:
@@ -383,11 +385,11 @@ def _write(
 
 
 @contextmanager
-def progress_bar(evaluator: Evaluator, total: int, shown: bool) -> Generator[Evaluator]:
+def progress_bar(evaluator: Evaluator, total: int, visible: bool) -> Generator[Evaluator]:
     """Show a progress bar of `total` rows; yields an evaluator that advances it."""
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), disable=not shown) as bar:
+    with Progress(console=Console(stderr=True), disable=not visible) as bar:
         task = bar.add_task("evaluating", total=total)
         yield replace(evaluator, advance=partial(bar.advance, task))

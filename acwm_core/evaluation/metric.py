@@ -86,8 +86,8 @@ class Prediction:
     ) -> Prediction:
         """An episode's own video, as a prediction of itself."""
         video = as_clip(episode.video)
-        made = cls.of(episode, video, video, card, estimator)
-        return replace(made, clip=clip or made.clip, kind="truth")
+        truth = cls.of(episode, video, video, card, estimator)
+        return replace(truth, clip=clip or truth.clip, kind="truth")
 
     def without(self, frames: int) -> Prediction:
         """The prediction without its first `frames` frames, as if the clip had begun later."""
@@ -140,7 +140,7 @@ class Prediction:
     def is_finite(self) -> bool:
         """Whether its video and those of all branches and draws are free of NaN and infinity."""
         own = bool(self.video.isfinite().all())
-        return own and all(each.is_finite for each in (*self.branches, *self.draws))
+        return own and all(prediction.is_finite for prediction in (*self.branches, *self.draws))
 
     def once(self, key: object, work_out: Callable[[], Result]) -> Result:
         """Compute a value that several metrics of this clip share, only once.
@@ -227,8 +227,8 @@ class Metric(ABC):
     def info(self) -> MetricInfo:
         """What tables and charts need to know about it."""
         title = self.title or self.name.replace("_", " ").capitalize()
-        shown = self.group, self.reads, self.factor, self.rank, self.definition, self.right
-        return MetricInfo(self.unit, self.higher_is_better, title, *shown)
+        facts = self.group, self.reads, self.factor, self.rank, self.definition, self.right
+        return MetricInfo(self.unit, self.higher_is_better, title, *facts)
 
     def unavailable(self, card: EnvironmentCard, estimator: StateEstimator | None) -> str | None:
         """Why this environment cannot be scored, in one sentence; None if it can.

@@ -36,7 +36,7 @@ from acwm_core.evaluation.score import (
     score,
 )
 from acwm_core.evaluation.tracks import tracks_of
-from acwm_core.evaluation.videos import ShownClip, pick_clips, shown
+from acwm_core.evaluation.videos import ClipVideo, pick_clips, video_of
 from acwm_core.model.shapes import Actions, Video
 from acwm_core.model.world_model import Mode
 
@@ -116,7 +116,7 @@ class Evaluator:
     def predictors(self) -> tuple[Predictor, ...]:
         """The rows that `scores` predicts; ``truth`` only if a metric reads states from video."""
         reads = any(needs_estimator(metric, self.card) for metric in self.metrics.values())
-        return tuple(each for each in self.rows if reads or each != "truth")
+        return tuple(row for row in self.rows if reads or row != "truth")
 
     @property
     def draws(self) -> int:
@@ -161,8 +161,8 @@ class Evaluator:
             draws: how many `Prediction.draws` the model makes of each clip; 0 for none.
         """
         given, number = truths[0].clip.given, max(draws, 1)
-        drawn = [draw_seeds(truth.clip.seed, number) for truth in truths]
-        seeds = [own[draw] for draw in range(number) for own in drawn]
+        seeds_of_clips = [draw_seeds(truth.clip.seed, number) for truth in truths]
+        seeds = [own[draw] for draw in range(number) for own in seeds_of_clips]
         true = torch.stack([truth.target for truth in truths]).to(self.device)
 
         def rollout(actions: Sequence[NDArray[np.float32]]) -> Video:
@@ -215,8 +215,8 @@ class Evaluator:
                     else []
                 )
                 with noting(first.where + until * (last != first), *self.world_model.children()):
-                    made = self.predict(truths, kinds, donated, draws)
-                yield made
+                    predictions = self.predict(truths, kinds, donated, draws)
+                yield predictions
 
     def scores(
         self,
@@ -227,16 +227,18 @@ class Evaluator:
         """Score all rows, or only those of `kinds`, of all clips of a split, clip by clip."""
         scores: list[Score] = []
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # NumPy releases the GIL
-            for made in self.predictions(clips, episodes, kinds or self.predictors, self.draws):
-                for rows in pool.map(self._rows, made):
+            for predictions in self.predictions(
+                clips, episodes, kinds or self.predictors, self.draws
+            ):
+                for rows in pool.map(self._rows, predictions):
                     scores += rows
-                self.advance(len(made))
+                self.advance(len(predictions))
         return scores
 
-    def _rows(self, made: Prediction) -> list[Score]:
-        if made.draws:
-            return score_draws(made.draws, self.metrics)
-        return [score(made, self.metrics)]
+    def _rows(self, prediction: Prediction) -> list[Score]:
+        if prediction.draws:
+            return score_draws(prediction.draws, self.metrics)
+        return [score(prediction, self.metrics)]
 
     def sweep(self, clips: Sequence[Clip], episodes: EpisodeDataset) -> dict[int, list[Score]]:
         """Score the model on the first clip of each of the first episodes, per `steps_sweep` entry.
@@ -259,32 +261,33 @@ class Evaluator:
 
     def videos(
         self, clips: Sequence[Clip], episodes: EpisodeDataset, scores: Sequence[Score]
-    ) -> list[ShownClip]:
+    ) -> list[ClipVideo]:
         """Videos of the best, median and worst clips, and the median ones with other actions too.
 
         Predicts these clips again with the same noise, so that `scores` need not keep all videos.
         """
         by_place = {(clip.episode, clip.start): clip for clip in clips}
         values = {(s.episode, s.start, s.kind): s.values for s in scores}
-        videos: list[ShownClip] = []
+        videos: list[ClipVideo] = []
         higher = self.metrics[self.headline].higher_is_better
         for place, pick in pick_clips(scores, self.headline, higher, self.config.videos).items():
             clip = by_place[place]
             wanted = ("model", "shuffled") if pick == "median" else ("model",)
-            kinds: list[Predictor] = [each for each in wanted if each in self.rows]
-            (made,) = self.predictions([clip], episodes, kinds)
-            for each in made:
-                actions = each.actions
-                if each.kind == "shuffled":
+            kinds: list[Predictor] = [kind for kind in wanted if kind in self.rows]
+            (predictions,) = self.predictions([clip], episodes, kinds)
+            for prediction in predictions:
+                actions = prediction.actions
+                if prediction.kind == "shuffled":
                     actions = donor_actions(clip, actions, episodes)
                 start = f"-{clip.start:04d}" if clip.start else ""
-                file = f"{clip.split}-{clip.episode:06d}{start}-{each.kind}.mp4"
-                own = values[*place, each.kind]
-                record, frames = shown(
-                    each, file, kind=each.kind, pick=pick, actions=actions, values=own
+                kind = prediction.kind
+                file = f"{clip.split}-{clip.episode:06d}{start}-{kind}.mp4"
+                own = values[*place, kind]
+                record, frames = video_of(
+                    prediction, file, kind=kind, pick=pick, actions=actions, values=own
                 )
-                if each.kind == "model":
-                    record = replace(record, tracks=tracks_of(self.world_model, each))
+                if kind == "model":
+                    record = replace(record, tracks=tracks_of(self.world_model, prediction))
                 videos.append((record, frames))
         return videos
 
@@ -295,7 +298,7 @@ class Evaluator:
 
 def _prediction(truth: Prediction, kind: Predictor, videos: Video, *, several: bool) -> Prediction:
     """What a row predicts of a clip; `videos` `[N, T, 3, H, W]` has its draws if there are any."""
-    made = replace(truth, video=videos[0], kind=kind)
+    predicted = replace(truth, video=videos[0], kind=kind)
     if kind != "model" or not several:
-        return made
-    return replace(made, draws=tuple(replace(made, video=video) for video in videos))
+        return predicted
+    return replace(predicted, draws=tuple(replace(predicted, video=video) for video in videos))

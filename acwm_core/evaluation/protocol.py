@@ -57,7 +57,7 @@ class PublishedTable:
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedComparison:
     """The published row that a run is compared with.
 
     Attributes:
@@ -124,18 +124,18 @@ def protocol_named(name: str) -> Protocol:
 
 def published_tables() -> dict[str, PublishedTable]:
     """The tables of all registered protocols by name; broken ones are skipped with a warning."""
-    found: dict[str, PublishedTable] = {}
-    for each in catalog().registry("protocol"):
+    tables: dict[str, PublishedTable] = {}
+    for component in catalog().registry("protocol"):
         try:
-            found |= each.create_as(Protocol).tables()
+            tables |= component.create_as(Protocol).tables()
         except Exception as error:  # the tables may not be needed, so only warn
             warnings.warn(f"left out: {sentence(error)}", AcwmWarning, stacklevel=2)
-    return found
+    return tables
 
 
-def published_for(setting: Mapping[str, str | float]) -> Published | None:
+def published_for(setting: Mapping[str, str | float]) -> PublishedComparison | None:
     """The first row with the same setting, else with the same environment; None if none matches."""
     rows = [row for table in published_tables().values() for row in table.rows]
     near = [row for row in rows if row.setting["env"] == setting["env"]]
-    found = next((row for row in near if row.setting == setting), near[0] if near else None)
-    return Published(found, same_parts=found.setting == setting) if found else None
+    row = next((row for row in near if row.setting == setting), near[0] if near else None)
+    return PublishedComparison(row, same_parts=row.setting == setting) if row else None

@@ -73,7 +73,7 @@ def provenance(
             "source": dict(card.source),
             "command": "" if secret else card.command(dataset.path),
             "factors": dict(card.factors),
-            "checksums": {split: each.checksum for split, each in datasets.items()},
+            "checksums": {split: episodes.checksum for split, episodes in datasets.items()},
             "versions": dict(card.versions),
         },
         "versions": {

@@ -40,17 +40,17 @@ def scores_with_references(
     the user's cache is writable.
     """
     file = references_file(evaluator, clips, episodes)
-    found: list[Score] = []
+    stored: list[Score] = []
     with contextlib.suppress(DataError, FileNotFoundError):  # damaged, or not there yet
-        found = load_scores(file) if file else []
-    asked: list[Predictor] = [k for k in evaluator.predictors if not found or k not in KEPT]
-    made = evaluator.scores(clips, episodes, asked)
-    evaluator.advance(len(found))
-    if file and not found:
+        stored = load_scores(file) if file else []
+    asked: list[Predictor] = [k for k in evaluator.predictors if not stored or k not in KEPT]
+    scores = evaluator.scores(clips, episodes, asked)
+    evaluator.advance(len(stored))
+    if file and not stored:
         with contextlib.suppress(OSError, DataError):  # e.g. a read-only cache
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_scores(file, [score for score in made if score.kind in KEPT])
-    rows = {(row.episode, row.start, row.kind): row for row in [*found, *made]}
+            write_scores(file, [score for score in scores if score.kind in KEPT])
+    rows = {(row.episode, row.start, row.kind): row for row in [*stored, *scores]}
     kinds = dict.fromkeys(("model", *DRAWN, *evaluator.predictors))
     places = [(c.episode, c.start, kind) for c in clips for kind in kinds]
     return [rows[place] for place in places if place in rows]
@@ -67,7 +67,7 @@ def references_file(
     """
     codec, estimator = evaluator.world_model.codec, evaluator.estimator
     components = [codec, *evaluator.metrics.values()]
-    packages = {type(each).__module__.partition(".")[0] for each in components}
+    packages = {type(component).__module__.partition(".")[0] for component in components}
     packages |= {acwm_core.__name__, *(estimator.packages() if estimator else ())}
     hashes = {name: package_hash(name) for name in sorted(packages)}
     if None in hashes.values():
@@ -99,14 +99,14 @@ def _files(episodes: EpisodeDataset) -> list[Any]:
         return [str(folder)]
     shards = [folder / shard_name(number) for number in range(len(episodes.shards))]
     states = [path.stat() if path.exists() else None for path in shards]
-    return [str(folder), *(each and (each.st_size, each.st_mtime_ns) for each in states)]
+    return [str(folder), *(stat and (stat.st_size, stat.st_mtime_ns) for stat in states)]
 
 
 @cache
 def installed_packages() -> list[str]:
     """Name and version of everything that is installed; reading that takes most of a second."""
-    found = (each.metadata for each in distributions())
-    return sorted(f"{facts['Name']} {facts['Version']}" for facts in found)
+    packages = (package.metadata for package in distributions())
+    return sorted(f"{facts['Name']} {facts['Version']}" for facts in packages)
 
 
 @cache

@@ -11,7 +11,7 @@ from pydantic import AliasChoices, Field
 
 from acwm_core.errors import DataError
 from acwm_core.evaluation.metric import MetricInfo as MetricInfo
-from acwm_core.evaluation.protocol import Published
+from acwm_core.evaluation.protocol import PublishedComparison
 from acwm_core.evaluation.statistics import Estimate as Estimate
 from acwm_core.evaluation.statistics import Paired as Paired
 from acwm_core.evaluation.statistics import defined as defined
@@ -337,7 +337,7 @@ class Summary:
     provenance: dict[str, Any] = field(default_factory=dict[str, Any])
     protocol: str = "full"
     left_out: dict[str, str] = field(default_factory=dict[str, str])
-    published: Published | None = None
+    published: PublishedComparison | None = None
     ensembles: dict[str, Ensemble] = field(default_factory=dict[str, Ensemble])
 
     @property
@@ -385,11 +385,13 @@ class Summary:
             OSError: it cannot be read.
             DataError: it is damaged, or from another version of acwm.
         """
-        found = read_json(path, Summary, "a summary")
-        scores = [split.scores.rows.get("model", {}) for split in found.splits.values()]
-        if not scores or not all(found.headline in row for row in (found.metrics, *scores)):
-            raise DataError(f"{path} is not a whole summary: it lacks the model's {found.headline}")
-        return found
+        summary = read_json(path, Summary, "a summary")
+        scores = [split.scores.rows.get("model", {}) for split in summary.splits.values()]
+        if not scores or not all(summary.headline in row for row in (summary.metrics, *scores)):
+            raise DataError(
+                f"{path} is not a whole summary: it lacks the model's {summary.headline}"
+            )
+        return summary
 
 
 def unfinished(facts: Mapping[str, Any]) -> str:

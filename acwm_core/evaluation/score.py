@@ -47,8 +47,8 @@ def build_metrics(
 def _build(config: MetricConfig) -> Metric:
     metric = config.create()
     if not isinstance(metric, Metric):
-        made = type(metric).__name__
-        raise PluginError(f"metric {config.component!r} makes a {made}, which is not a Metric")
+        kind = type(metric).__name__
+        raise PluginError(f"metric {config.component!r} makes a {kind}, which is not a Metric")
     if config.name not in (metric.name, config.component):
         rest = config.name.removeprefix(f"{metric.name}_")  # ``lpips_vgg`` gives ``LPIPS vgg``
         title, words = metric.info.title, rest.replace("_", " ")
@@ -77,7 +77,7 @@ def measure_facts(
     """What scores depend on besides the videos: ``metrics`` and ``estimator`` of `provenance`."""
     facts = {name: dict(metric.provenance()) for name, metric in metrics.items()}
     return {
-        "metrics": {name: each for name, each in facts.items() if each},
+        "metrics": {name: fact for name, fact in facts.items() if fact},
         "estimator": dict(estimator.provenance()) if estimator else None,
     }
 
@@ -101,7 +101,7 @@ def quick_metrics(metrics: Mapping[str, Metric], card: EnvironmentCard) -> dict[
 
 def predictors_for(clip: Clip, predictors: Sequence[Predictor]) -> list[Predictor]:
     """Those of `predictors` that apply to a clip; ``truth`` only if its noise floor is measured."""
-    return [each for each in predictors if each != "truth" or clip.noise_floor]
+    return [predictor for predictor in predictors if predictor != "truth" or clip.noise_floor]
 
 
 def measured_in(
@@ -133,8 +133,8 @@ def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
     measured = metrics
     if not prediction.draws:
         measured = measured_in(prediction.kind, clip, metrics, prediction.card)
-    shown = prediction.without(clip.given - 1)
-    frames = len(shown.target)
+    scored_part = prediction.without(clip.given - 1)
+    frames = len(scored_part.target)
     scored = Score(
         split=clip.split,
         episode=clip.episode,
@@ -145,18 +145,18 @@ def score(prediction: Prediction, metrics: Mapping[str, Metric]) -> Score:
         values=dict.fromkeys(metrics, math.nan),
         weights=dict.fromkeys(metrics, 0.0),
         curves=dict.fromkeys(metrics, [math.nan] * frames),
-        failed=not shown.is_finite,
+        failed=not scored_part.is_finite,
     )
-    parts = parts_of(shown)
+    parts = parts_of(scored_part)
     with torch.autocast("cpu", enabled=False):
         for name, metric in measured.items():
-            part = shown if scored.failed else parts[metric_and_view(name)[1]]
+            part = scored_part if scored.failed else parts[metric_and_view(name)[1]]
             with noting(f"in metric {name!r} {clip.where}", metric):
                 curve = np.full(frames, metric.worst) if scored.failed else metric.curve(part)
                 scored.values[name], scored.weights[name] = metric.scored(part, curve)
                 scored.curves[name] = curve.astype(np.float32).tolist()
                 if metric.reads == "states":
-                    seen = 0.0 if scored.failed else metric.coverage(shown, curve)
+                    seen = 0.0 if scored.failed else metric.coverage(scored_part, curve)
                     scored.shares[name] = float(seen)
                 if isinstance(metric, SetMetric) and not scored.failed:
                     features = np.asarray(metric.features(part))

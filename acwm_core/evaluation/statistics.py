@@ -106,9 +106,9 @@ def paired_bootstrap(
     if error <= FLAT * abs(mean):  # all differences are the same number
         return PairedDifference(mean, mean, mean, 1.0 if mean == 0 else least, count)
     extremes = np.abs(studentised([values], seed, resamples))
-    found = around(mean, extremes * error)
+    interval = around(mean, extremes * error)
     p = max(least, (1 + int((extremes >= abs(mean) / error).sum())) / (resamples + 1))
-    return PairedDifference(mean, found.low, found.high, p, count)
+    return PairedDifference(mean, interval.low, interval.high, p, count)
 
 
 def with_interval(value: float, groups: Sequence[Values], seed: int = 0) -> Estimate:
@@ -134,12 +134,12 @@ def around(value: float, errors: Values) -> Estimate:
     return Estimate(float(value), float(value) - reach, float(value) + reach)
 
 
-def within(found: Estimate, bounds: tuple[float, float]) -> Estimate:
+def within(estimate: Estimate, bounds: tuple[float, float]) -> Estimate:
     """The part of an interval that lies within the bounds of its number."""
-    if found.low is None or found.high is None:
-        return found
+    if estimate.low is None or estimate.high is None:
+        return estimate
     lowest, highest = bounds
-    return Estimate(found.value, max(found.low, lowest), min(found.high, highest))
+    return Estimate(estimate.value, max(estimate.low, lowest), min(estimate.high, highest))
 
 
 def standard_error(values: Values) -> float:
@@ -157,8 +157,8 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
     means, variances, scale = np.zeros(resamples), np.zeros(resamples), np.zeros(resamples)
     for number, values in enumerate(groups):
         count, centred = len(values), values - values.mean()
-        drawn = episode_counts(count, seed + number, resamples)
-        first, second = (drawn @ np.stack([centred, centred**2], 1)).T / count
+        draws = episode_counts(count, seed + number, resamples)
+        first, second = (draws @ np.stack([centred, centred**2], 1)).T / count
         means += first
         variances += (second - first**2) / (count - 1)
         scale += second / (count - 1)
@@ -169,8 +169,8 @@ def studentised(groups: Sequence[Values], seed: int, resamples: int = RESAMPLES)
 @functools.lru_cache(maxsize=4)
 def episode_counts(count: int, seed: int, resamples: int) -> Values:
     """How often each of `count` episodes is drawn in each resample, `[resamples, count]`."""
-    drawn = np.random.default_rng(seed).integers(count, size=(resamples, count))
-    own = drawn + count * np.arange(resamples)[:, None]  # so that one bincount serves all resamples
+    draws = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    own = draws + count * np.arange(resamples)[:, None]  # so that one bincount serves all resamples
     counts = np.bincount(own.ravel(), minlength=resamples * count).reshape(resamples, count)
     return counts.astype(np.float64)
 
@@ -252,7 +252,7 @@ class ClipScores:
                 totals = np.bincount(place, held.weights)
                 without = (sums.sum() - sums) / (totals.sum() - totals)
             else:
-                without = np.array([held._summed_up(place != each) for each in range(count)])
+                without = np.array([held._summed_up(place != episode) for episode in range(count)])
             return count * held.summary() - (count - 1) * without
 
     def _summed_up(self, kept: NDArray[np.bool_]) -> float:

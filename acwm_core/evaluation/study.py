@@ -10,7 +10,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.evaluation.clips import Clip
 from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Score
-from acwm_core.evaluation.videos import ShownClip
+from acwm_core.evaluation.videos import ClipVideo
 
 Clips = Mapping[str, Sequence[Clip]]
 """Clips by split."""
@@ -31,7 +31,7 @@ class Findings:
     scores: Mapping[str, Sequence[Score]] = field(default_factory=dict[str, list[Score]])
     splits: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     summary: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    videos: Sequence[ShownClip] = ()
+    videos: Sequence[ClipVideo] = ()
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
 
 

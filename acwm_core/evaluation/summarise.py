@@ -75,12 +75,12 @@ def summarise(results: Sequence[Score], metrics: Metrics, seed: int) -> SetSumma
 
 def shares(row: Sequence[Score]) -> dict[str, float]:
     """The mean share that is scored of the clips of a row, by metric; see `Metric.coverage`."""
-    found: dict[str, list[float]] = {}
+    by_metric: dict[str, list[float]] = {}
     for score in row:
         for name, share in score.shares.items():
-            found.setdefault(name, []).append(share)
-    known = {name: [x for x in each if not math.isnan(x)] for name, each in found.items()}
-    return {name: float(np.mean(each)) for name, each in known.items() if each}
+            by_metric.setdefault(name, []).append(share)
+    known = {name: [x for x in values if not math.isnan(x)] for name, values in by_metric.items()}
+    return {name: float(np.mean(values)) for name, values in known.items() if values}
 
 
 def steps_curve(sweep: Mapping[int, Sequence[Score]], metrics: Metrics, seed: int) -> StepsCurve:
@@ -91,7 +91,7 @@ def steps_curve(sweep: Mapping[int, Sequence[Score]], metrics: Metrics, seed: in
     points: list[StepsPoint] = []
     for steps, row in rows.items():
         beyond = _compared(row, rows[max(rows)], metrics, seed)
-        change = {name: each.difference for name, each in beyond.items()}
+        change = {name: paired.difference for name, paired in beyond.items()}
         points.append(StepsPoint(steps, {n: s.estimate(seed) for n, s in row.items()}, change))
     return StepsCurve(len(sweep[max(sweep)]), points)
 

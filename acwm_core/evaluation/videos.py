@@ -14,7 +14,7 @@ from acwm_core.evaluation.results import DIVIDER, Score, VideoRecord
 from acwm_core.evaluation.statistics import finite
 from acwm_core.model.shapes import Clip
 
-ShownClip = tuple[VideoRecord, NDArray[np.uint8]]
+ClipVideo = tuple[VideoRecord, NDArray[np.uint8]]
 """A record and its frames `[T, H, W, 3]`."""
 
 FULL_ERROR = 0.5
@@ -33,7 +33,7 @@ _HEAT_LEVELS = (0.0, 0.15, 0.4, 0.7, 1.0)
 _HEAT_COLOURS = (DARK, (58, 22, 92), (176, 44, 98), (245, 132, 60), (255, 244, 196))
 
 
-def shown(
+def video_of(
     prediction: Prediction,
     file: str,
     *,
@@ -41,7 +41,7 @@ def shown(
     pick: str,
     actions: NDArray[np.float32],
     values: Mapping[str, float] | None = None,
-) -> ShownClip:
+) -> ClipVideo:
     """The video of a prediction and its record, see `VideoRecord`."""
     panels, frames = case_study(
         prediction.target,
@@ -91,13 +91,13 @@ def case_study(
     all zero), a fourth panel shows the masks of moving instances over the prediction, and the
     panels form a 2×2 grid. If `stacked`, all are one below the other, because each is wide.
     """
-    names, made = ["truth", "prediction", "difference"], panels(truth, prediction)
+    names, pictures = ["truth", "prediction", "difference"], panels(truth, prediction)
     if masks.any():
         names.append("truth over prediction")
-        made.append(tinted(made[1], moving_instances(masks)))
+        pictures.append(tinted(pictures[1], moving_instances(masks)))
     across = 1 if stacked else 2 if masks.any() else 3
-    firsts = range(0, len(made), across)
-    rows = [join_panels(made[first : first + across]) for first in firsts]
+    firsts = range(0, len(pictures), across)
+    rows = [join_panels(pictures[first : first + across]) for first in firsts]
     return [names[first : first + across] for first in firsts], join_panels(rows, down=True)
 
 

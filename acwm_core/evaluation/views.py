@@ -34,7 +34,7 @@ def metrics_of_views(
 
     Distances between sets of clips are left to the whole frame.
     """
-    found: dict[str, Metric] = {}
+    of_views: dict[str, Metric] = {}
     left_out: dict[str, str] = {}
     own = _card_of_a_view(card) if card.views else card
     for view in card.view_names:
@@ -45,8 +45,8 @@ def metrics_of_views(
             if reason:
                 left_out[of_view(name, view)] = reason
             else:
-                found[of_view(name, view)] = _renamed(metric, view)
-    return found, left_out
+                of_views[of_view(name, view)] = _renamed(metric, view)
+    return of_views, left_out
 
 
 def parts_of(prediction: Prediction) -> dict[str, Prediction]:
@@ -77,6 +77,6 @@ def _card_of_a_view(card: EnvironmentCard) -> EnvironmentCard:
 
 def _renamed(metric: Metric, view: str) -> Metric:
     """The same metric under the name of a view; it shares networks with the other."""
-    made = copy.copy(metric)
-    made.name, made.title = of_view(metric.name, view), f"{metric.info.title} {view}"
-    return made
+    of_own = copy.copy(metric)
+    of_own.name, of_own.title = of_view(metric.name, view), f"{metric.info.title} {view}"
+    return of_own

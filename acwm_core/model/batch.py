@@ -39,13 +39,13 @@ class Batch:
 
         `[B, N]`, with N = `frames`, or `among` if that is fewer.
         """
-        orders = [torch.randperm(among, generator=each) for each in self.generators]
+        orders = [torch.randperm(among, generator=generator) for generator in self.generators]
         return to_device(torch.stack(orders)[:, :frames], self.latents, torch.int64)
 
 
 def noise_of_clips(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
     """Standard normal noise `[B, *shape]` on the CPU; each clip has its own generator."""
-    return torch.stack([torch.randn(tuple(shape), generator=each) for each in generators])
+    return torch.stack([torch.randn(tuple(shape), generator=generator) for generator in generators])
 
 
 def to_device(tensor: Tensor, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:

@@ -73,9 +73,9 @@ class Codec(nn.Module, ABC):
         if missing:
             video = torch.cat([video, video[:, -1:].expand(-1, missing, -1, -1, -1)], dim=1)
         length, size = self.latent_frames(frames), self.latent_size(*video.shape[3:])
-        made = self._encode(video)
-        check_shape(self, "_encode", made, len(video), length, self.channels, *size)
-        return made.float()
+        latents = self._encode(video)
+        check_shape(self, "_encode", latents, len(video), length, self.channels, *size)
+        return latents.float()
 
     def decode(self, latents: Latent, frames: int | None = None) -> Video:
         """Decode `[B, L, C, h, w]` to video in [0, 1], cut to `frames` if given.

@@ -91,14 +91,16 @@ class Conditioner(nn.Module, ABC):
         Raises:
             PluginError: the result has the wrong type or shape.
         """
-        made: object = self(actions)
-        if not isinstance(made, Conditioning):
-            raise PluginError(f"{type(self).__name__}.forward gives {made!r:.40}, no Conditioning")
-        if made.modulation is not None:
-            check_shape(self, "modulation", made.modulation, len(actions), frames, width)
-        if made.context is not None:
-            check_shape(self, "context", made.context, len(actions), frames, -1, width)
-        return made
+        conditioning: object = self(actions)
+        if not isinstance(conditioning, Conditioning):
+            raise PluginError(
+                f"{type(self).__name__}.forward gives {conditioning!r:.40}, no Conditioning"
+            )
+        if conditioning.modulation is not None:
+            check_shape(self, "modulation", conditioning.modulation, len(actions), frames, width)
+        if conditioning.context is not None:
+            check_shape(self, "context", conditioning.context, len(actions), frames, -1, width)
+        return conditioning
 
     def inject_input(self, tokens: Tokens, conditioning: Conditioning) -> Tokens:
         """Change the tokens `[B, L, N, D]` before the first layer; unchanged by default."""

@@ -60,8 +60,8 @@ class DynamicsModel(nn.Module, ABC):
 
     Every model takes the keyword argument `latent_channels`, which follows from the codec, and what
     else its `fitted` takes from the data. Its own parameters come after these and are set in the
-    recipe. The latent size h × w and the
-    length L are those of the input; a model raises `ShapeError` for sizes it does not support.
+    recipe. The latent size h × w and the length L are those of the input; a model raises
+    `ShapeError` for sizes it does not support.
 
     A model with layers calls the conditioner before the first one (`Conditioning.inject_input`) and
     after each (`Conditioning.inject`), and continues with the tokens that it returns. Otherwise, a
@@ -370,9 +370,9 @@ class Cache(ABC):
 
 def hidden_matrices(module: nn.Module) -> list[nn.Parameter]:
     """The trainable weights of linear layers within `nn.ModuleList`s."""
-    found: dict[int, nn.Parameter] = {}
-    for blocks in (each for each in module.modules() if isinstance(each, nn.ModuleList)):
-        for linear in (each for each in blocks.modules() if isinstance(each, nn.Linear)):
+    weights: dict[int, nn.Parameter] = {}
+    for blocks in (part for part in module.modules() if isinstance(part, nn.ModuleList)):
+        for linear in (part for part in blocks.modules() if isinstance(part, nn.Linear)):
             if linear.weight.requires_grad:
-                found[id(linear.weight)] = cast(nn.Parameter, linear.weight)
-    return list(found.values())
+                weights[id(linear.weight)] = cast(nn.Parameter, linear.weight)
+    return list(weights.values())

@@ -70,7 +70,7 @@ def bfloat16_slowdown(device: torch.device) -> float:
         product = nn.Linear(width, width, device=device)
     layers = ((convolution, image), (product, rows))
     reduced, full = (
-        sum(_fastest(functools.partial(_step, *each, on)) for each in layers)
+        sum(_fastest(functools.partial(_step, *layer, on)) for layer in layers)
         for on in (True, False)
     )
     return reduced / full

@@ -205,7 +205,7 @@ def _check(
     expand: bool = True,
 ) -> dict[str, Any]:
     """Check the values of a section's parameters; with `expand`, write out the others' defaults."""
-    takes = {name: each for name, each in taken.parameters.items() if name not in fitted}
+    takes = {name: parameter for name, parameter in taken.parameters.items() if name not in fitted}
     for name, value in values.items():
         if name in fitted:
             raise RecipeError(f"{section}.{name} follows from the other components; omit it")

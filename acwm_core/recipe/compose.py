@@ -202,6 +202,6 @@ def find_recipe(name: str, folder: Path) -> Path:
         known = {path.removesuffix(".yaml") for path in known}
     near = suggest(name, known)
     if "did you mean" not in near:
-        main = [each for each in recipe_names() if each in catalog().registry("environment")]
+        main = [recipe for recipe in recipe_names() if recipe in catalog().registry("environment")]
         near = f"; the main ones are {', '.join(main)} (see `acwm list recipe`)"
     raise RecipeError(f"there is no recipe {name!r}{near}")

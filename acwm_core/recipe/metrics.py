@@ -94,5 +94,5 @@ def class_of_library(component: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
-        known = [each for each in dir(sys.modules.get(module)) if each[:1].isupper()]
+        known = [attribute for attribute in dir(sys.modules.get(module)) if attribute[:1].isupper()]
         raise RecipeError(f"there is no {component}{suggest(name, known)}") from None

@@ -140,7 +140,11 @@ def compose(
 
 def recipe_differences(before: Recipe, now: Recipe) -> list[str]:
     """What a resumed run would change, as phrases such as ``"model.layers was 4, is 6"``."""
-    return [each for each in differences(before, now) if not each.startswith(FREE_TO_CHANGE)]
+    return [
+        difference
+        for difference in differences(before, now)
+        if not difference.startswith(FREE_TO_CHANGE)
+    ]
 
 
 def differences(before: Recipe, now: Recipe, *, only_set: bool = False) -> list[str]:

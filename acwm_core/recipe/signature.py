@@ -34,7 +34,7 @@ def signature(target: Callable[..., Any]) -> Signature:
     name = getattr(target, "__name__", type(target).__name__)
     if not isinstance(target, type):
         return Signature(name, *_named(target, inspect.signature(target)))
-    found: dict[str, Parameter] = {}
+    inherited: dict[str, Parameter] = {}
     passes_on = False
     for base in target.__mro__:
         constructor: Any = vars(base).get("__init__")
@@ -43,10 +43,10 @@ def signature(target: Callable[..., Any]) -> Signature:
         parameters = [*inspect.signature(constructor).parameters.values()][1:]  # without self
         typed = base if is_dataclass(base) else constructor
         own, passes_on = _named(typed, inspect.Signature(parameters))
-        found = {**own, **found}
+        inherited = {**own, **inherited}
         if not passes_on:
             break
-    return Signature(name, found, passes_on)
+    return Signature(name, inherited, passes_on)
 
 
 def _named(typed: Any, taken: inspect.Signature) -> tuple[dict[str, Parameter], bool]:
@@ -57,8 +57,8 @@ def _named(typed: Any, taken: inspect.Signature) -> tuple[dict[str, Parameter], 
         types = dict[str, Any]()
     parameters = taken.parameters.values()
     named = {
-        each.name: Parameter(types.get(each.name, Any), each.default)
-        for each in parameters
-        if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)
+        parameter.name: Parameter(types.get(parameter.name, Any), parameter.default)
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
     }
-    return named, any(each.kind is each.VAR_KEYWORD for each in parameters)
+    return named, any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)

@@ -61,7 +61,7 @@ def refuse_code(
     Raises:
         RecipeError: it names code; says where, and how to allow it.
     """
-    typed = with_overrides({}, [each for each in overrides if not each.startswith("+")])
+    typed = with_overrides({}, [override for override in overrides if not override.startswith("+")])
     known = dict(_code(typed))
     used = {name: recipe[name] for name in recipe if sections is None or name in {*sections}}
     for place, value in _code(used):

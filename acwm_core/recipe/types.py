@@ -84,9 +84,9 @@ def describe(expected: Any) -> str:
 
 def _with_range(base: Any, metadata: Sequence[Any]) -> str:
     limits = [
-        f"{words} {getattr(each, kind.__name__.lower()):g}"
-        for each in metadata
+        f"{words} {getattr(limit, kind.__name__.lower()):g}"
+        for limit in metadata
         for kind, words in _BOUNDS.items()
-        if isinstance(each, kind)
+        if isinstance(limit, kind)
     ]
     return " ".join([describe(base), *limits[:1], *(f"and {limit}" for limit in limits[1:])])

@@ -115,7 +115,7 @@ def _are_finite(tensors: Iterable[Tensor]) -> bool:
     sharded = [tensor for tensor in floating if isinstance(tensor, DTensor)]
     whole = [tensor for tensor in floating if not isinstance(tensor, DTensor)]
     # Compute both norms before answering, as all ranks must compute them together.
-    norms = [total_norm(each) for each in (sharded, whole) if each]
+    norms = [total_norm(gradients) for gradients in (sharded, whole) if gradients]
     return all(bool(norm.isfinite()) for norm in norms)
 
 
@@ -239,28 +239,28 @@ class ValidationRollouts(Callback):
         assert isinstance(pl_module, TrainingModule)
         own = range(trainer.global_rank, len(self._video), trainer.world_size)
         # Sharded weights are gathered layer by layer, so all processes must predict together.
-        shown = [*(range(len(self._video)) if pl_module.is_sharded else own)]
+        rows = [*(range(len(self._video)) if pl_module.is_sharded else own)]
         metrics: list[Any] = [self._psnr, self._still, self._ssim]
         for metric in metrics:
             metric.to(pl_module.device).reset()
-        if shown:
-            truth = self._video[shown].to(pl_module.device) / 255
-            actions = self._actions[shown].to(pl_module.device)
+        if rows:
+            truth = self._video[rows].to(pl_module.device) / 255
+            actions = self._actions[rows].to(pl_module.device)
             steps = min(pl_module.averaged.objective.steps or 1, MAX_ROLLOUT_STEPS)
             model = pl_module.averaged
             known = model.context_frames
             given = truth[:, :known]
-            made = pl_module.rollout(given, actions, steps=steps, seeds=shown)
+            predicted = pl_module.rollout(given, actions, steps=steps, seeds=rows)
             if trainer.is_global_zero:
-                strip = draw_strip(truth, made)
+                strip = draw_strip(truth, predicted)
                 for logger in trainer.loggers:
                     show_picture(logger, STRIP, strip, trainer.global_step)
-            clips = (video[:, known - 1 :] for video in (truth, made.to(truth)))
-            for place, true, made in zip(shown, *clips, strict=True):
+            clips = (video[:, known - 1 :] for video in (truth, predicted.to(truth)))
+            for place, true, video in zip(rows, *clips, strict=True):
                 if place in own:
-                    self._psnr.update(made, true)
+                    self._psnr.update(video, true)
                     self._still.update(true[:1].expand_as(true), true)
-                    self._ssim.update(made, true)
+                    self._ssim.update(video, true)
         psnr, still, ssim = (metric.compute() for metric in metrics)
         psnr, still = psnr.clamp(max=MAX_PSNR), still.clamp(max=MAX_PSNR)
         pl_module.log("val/psnr", psnr, prog_bar=True, sync_dist=True)

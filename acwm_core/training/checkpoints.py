@@ -54,7 +54,7 @@ def without_codec(state: Mapping[str, Any]) -> dict[str, Any]:
 
 def last_whole(path: Path) -> Path | None:
     """The checkpoint `path`, or its predecessor if a process died while replacing it."""
-    return next((found for found in (path, _old(path)) if found.exists()), None)
+    return next((place for place in (path, _old(path)) if place.exists()), None)
 
 
 def read_details(path: Path) -> dict[str, Any]:
@@ -82,12 +82,12 @@ def read_whole(path: Path) -> dict[str, Any]:
 def _load(file: Path, *, mmap: bool = False) -> dict[str, Any]:
     """The dict in a file of `torch.save`, read without executing anything in it."""
     try:
-        found = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
+        content = torch.load(file, map_location="cpu", mmap=mmap, weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError) as error:
         raise _damaged(file, error) from error
-    if not isinstance(found, dict):
-        raise _damaged(file, TypeError(f"it holds a {type(found).__name__}"))
-    return cast(dict[str, Any], found)
+    if not isinstance(content, dict):
+        raise _damaged(file, TypeError(f"it holds a {type(content).__name__}"))
+    return cast(dict[str, Any], content)
 
 
 def _damaged(path: Path, error: BaseException) -> TrainingError:
@@ -174,17 +174,17 @@ class _Reader(FileSystemReader):
         """
         file = Path(cast(Any, self).path) / ".metadata"
         try:
-            index: metadata.Metadata = _Index(io.BytesIO(file.read_bytes())).load()
+            index: metadata.Metadata = _IndexUnpickler(io.BytesIO(file.read_bytes())).load()
         except (pickle.UnpicklingError, EOFError, LookupError, ValueError, OSError) as error:
             raise _damaged(file, error) from error
         files = cast(dict[Any, Any], index.storage_data).values()
-        if any(Path(each.relative_path).name != each.relative_path for each in files):
+        if any(Path(file.relative_path).name != file.relative_path for file in files):
             raise TrainingError(f"{file} names files of other folders")
         index.storage_meta = metadata.StorageMeta(load_id=self.load_id)
         return index
 
 
-class _Index(pickle.Unpickler):
+class _IndexUnpickler(pickle.Unpickler):
     """Unpickles what PyTorch writes into the index of a folder, and refuses every other name."""
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:

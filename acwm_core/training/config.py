@@ -36,10 +36,10 @@ def chosen_loggers(flags: Mapping[str, Any]) -> list[Any]:
     """
     given = flags.get("logger")
     listed = cast(list[Any], given if isinstance(given, list) else [given])
-    for each in listed:
-        if isinstance(each, str) and each not in LOGGERS:
-            raise unknown_name("logger", each, LOGGERS)
-    return [each for each in listed if not isinstance(each, bool | None)]
+    for logger in listed:
+        if isinstance(logger, str) and logger not in LOGGERS:
+            raise unknown_name("logger", logger, LOGGERS)
+    return [logger for logger in listed if not isinstance(logger, bool | None)]
 
 
 def check_together(training: Mapping[str, Any], trainer: Mapping[str, Any]) -> None:

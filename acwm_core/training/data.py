@@ -90,11 +90,11 @@ class ClipData(L.LightningDataModule):
         if not self.states:
             return torch.zeros(0), torch.ones(0)
         scales = [self._scale_of(name) for name in self.states]
-        mean, std = (np.concatenate(each) for each in zip(*scales, strict=True))
+        mean, std = (np.concatenate(parts) for parts in zip(*scales, strict=True))
         return torch.tensor(mean, dtype=torch.float32), torch.tensor(std, dtype=torch.float32)
 
     def _scale_of(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        rows = np.concatenate([self.episodes.states(each, [name]) for each in self._split[0]])
+        rows = np.concatenate([self.episodes.states(index, [name]) for index in self._split[0]])
         mean, std = rows.mean(0, dtype=np.float64), rows.std(0, dtype=np.float64)
         std[std <= ROUNDING * max(np.abs(mean).max(), std.max())] = 1
         return mean, std
@@ -114,8 +114,8 @@ class ClipData(L.LightningDataModule):
         if not held_out or not clips:
             return torch.empty(0, 1, 3, 1, 1, dtype=torch.uint8), torch.empty(0, 1, 1)
         starts = self._clips(held_out, self._once, cached=False, per_length=clips)
-        shown = next(iter(ClipLoader(starts, InOrder(starts.lengths, clips))))
-        return shown["video"], shown["actions"]
+        first_clips = next(iter(ClipLoader(starts, InOrder(starts.lengths, clips))))
+        return first_clips["video"], first_clips["actions"]
 
     def setup(self, stage: str) -> None:
         """Encode clips that are not encoded yet, each rank a part on its device; open the clips."""

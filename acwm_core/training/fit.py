@@ -156,7 +156,7 @@ def _train(
         described(run, recipe, episodes.card, checkpoint is None, module),
         preemption.watching(trainer),
     ):
-        for logger in [each for each in trainer.loggers if each not in continued]:
+        for logger in [logger for logger in trainer.loggers if logger not in continued]:
             begin(logger)  # those of the recipe's own classes
             logger.log_hyperparams(recipe.to_dict())
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
@@ -213,7 +213,7 @@ def _with_states(recipe: Recipe, episodes: EpisodeDataset) -> Recipe:
     if recipe.data.get("states") or choose.__func__ is DynamicsModel.default_states.__func__:
         return recipe
     card = episodes.card.environment
-    names = [each.name for each in card.state]
+    names = [field.name for field in card.state]
     changing = [name for name in names if np.ptp(episodes.states(0, [name]), 0).any()]
     chosen = choose(card, changing, **recipe.model.params)
     return replace(recipe, data={**recipe.data, "states": [*chosen]})
@@ -236,10 +236,10 @@ def _start_from(
         load_weights(world_model, initial.weights)
     except TrainingError as error:
         others = recipe_differences(Recipe.from_yaml(initial.recipe), recipe)
-        of_the_model = [each for each in others if each.startswith("model.")]
+        of_the_model = [difference for difference in others if difference.startswith("model.")]
         parts = ("model", "codec", "conditioner")
         anyway = ["training.ignore_mismatched_sizes=true takes what fits"]
-        anyway = anyway if any(each.startswith(parts) for each in others) else []
+        anyway = anyway if any(difference.startswith(parts) for difference in others) else []
         raise TrainingError("; ".join([str(error), *of_the_model, *anyway])) from error
     return all_training(name, initial)
 
@@ -247,22 +247,18 @@ def _start_from(
 def _callbacks(run: RunFolder, config: TrainingConfig, data: ClipData) -> list[Callback]:
     chosen: list[Callback] = [
         callbacks.NanGuard(run),
-        RecordedPrecision(),
         callbacks.SavedWeights(run),
         StepProgress(),
         callbacks.LastCheckpoint(run.last_checkpoint, config.checkpoint_every_n_steps),
         callbacks.BestCheckpoint(run.checkpoints),
         Throughput(data.frames, data.episodes.card.environment.frame_size),
     ]
-    every, shown, rollouts = (
-        config.sample_every_n_steps,
-        config.sample_videos,
-        config.validation_rollouts,
-    )
-    video, actions = data.sample(max(shown if every else 0, rollouts))
+    every, count = config.sample_every_n_steps, config.sample_videos
+    rollouts = config.validation_rollouts
+    video, actions = data.sample(max(count if every else 0, rollouts))
     if every and len(video):
         fps = data.episodes.card.environment.fps
-        chosen.append(callbacks.SampleVideos(run, every, video[:shown], actions[:shown], fps))
+        chosen.append(callbacks.SampleVideos(run, every, video[:count], actions[:count], fps))
     if rollouts and len(video):
         chosen.append(callbacks.ValidationRollouts(video[:rollouts], actions[:rollouts]))
     return chosen
@@ -272,15 +268,15 @@ def _check_environment(recipe: Recipe, card: DatasetCard) -> None:
     """Refuse a recipe whose environment or frame size differs from those of the data."""
     if recipe.env is None:
         return
-    found = card.environment
-    if recipe.env.name != found.name:
+    own = card.environment
+    if recipe.env.name != own.name:
         raise TrainingError(
-            f"{recipe.data['path']} holds episodes of {found.name}, but the recipe says "
-            f"env={recipe.env.name}: set env={found.name} or env=null, or another data.path"
+            f"{recipe.data['path']} holds episodes of {own.name}, but the recipe says "
+            f"env={recipe.env.name}: set env={own.name} or env=null, or another data.path"
         )
     size = recipe.env.params.get("size")
-    if size is not None and resolve_size(size, found.frame_size) != found.frame_size:
-        height, width = found.frame_size
+    if size is not None and resolve_size(size, own.frame_size) != own.frame_size:
+        height, width = own.frame_size
         raise TrainingError(
             f"{recipe.data['path']} holds frames of {height}×{width}: leave out env.size, or "
             "generate data of that size"

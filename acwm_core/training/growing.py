@@ -31,8 +31,8 @@ class GrowingClipData(ClipData):
     """
 
     def _divided(self) -> tuple[Sequence[int], range]:
-        there, made = len(self.episodes), self.episodes.card.splits["train"]
-        held = len(hold_out(made, self.config.validation_episodes)[1])
+        there, promised = len(self.episodes), self.episodes.card.splits["train"]
+        held = len(hold_out(promised, self.config.validation_episodes)[1])
         if there <= held:
             raise DataError(
                 f"{self.episodes.path} holds {there} finished episodes so far, and the first "
@@ -66,9 +66,9 @@ class GrowingClipData(ClipData):
 
     def _pass_at(self, position: int) -> int:
         """The number of the pass at a position, begun if it is new; opens its clips."""
-        for number, each in enumerate(self._passes):
-            if each.start <= position < each.start + each.clips:
-                self._open(each.episodes)
+        for number, passed in enumerate(self._passes):
+            if passed.start <= position < passed.start + passed.clips:
+                self._open(passed.episodes)
                 return number
         if position:  # the first pass takes what `setup` opened a moment ago
             self._open(None)
@@ -96,7 +96,7 @@ class GrowingClipData(ClipData):
 
     def state_dict(self) -> dict[str, Any]:
         """As without growing, and the passes begun so far."""
-        return {**super().state_dict(), "passes": [list(each) for each in self._passes]}
+        return {**super().state_dict(), "passes": [list(passed) for passed in self._passes]}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Go on with the passes of the run.
@@ -105,7 +105,7 @@ class GrowingClipData(ClipData):
             TrainingError: an optimiser step takes a different number of clips than before.
         """
         super().load_state_dict(state_dict)
-        self._passes = [Pass(*each) for each in state_dict["passes"]]
+        self._passes = [Pass(*values) for values in state_dict["passes"]]
 
 
 class _Endless:

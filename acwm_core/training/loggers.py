@@ -79,7 +79,7 @@ def build_loggers(run: RunFolder, flags: Mapping[str, Any], first_step: int) -> 
             run.path, "tensorboard", "", default_hp_metric=False, purge_step=first_step or None
         )
         loggers.append(board)
-    named = [each for each in chosen if isinstance(each, str) and LOGGERS[each]]
+    named = [logger for logger in chosen if isinstance(logger, str) and LOGGERS[logger]]
     return [*loggers, *(build_tracker(name, run) for name in named)]
 
 
@@ -134,7 +134,7 @@ class MetricsFile(Logger):
             with partial.open("w", newline="") as after:
                 writer = csv.DictWriter(after, self._columns, restval="")
                 writer.writeheader()
-                writer.writerows(each for each in rows if not is_first or self._is_before(each))
+                writer.writerows(row for row in rows if not is_first or self._is_before(row))
 
     def _is_before(self, row: Mapping[str, str]) -> bool:
         """Whether a row has its step, and it is one before the first."""

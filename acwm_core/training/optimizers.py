@@ -58,7 +58,9 @@ class JoinedOptimizer(Optimizer):
 
     def __init__(self, *optimizers: Optimizer) -> None:
         self._optimizers = optimizers
-        super().__init__([group for each in optimizers for group in each.param_groups], {})
+        super().__init__(
+            [group for optimizer in optimizers for group in optimizer.param_groups], {}
+        )
         self._share()
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
@@ -96,7 +98,7 @@ def parameter_groups(
     """
     left_out = {id(parameter) for parameter in without}
     embeddings = [child for child in module.modules() if isinstance(child, nn.Embedding)]
-    tables = {id(parameter) for each in embeddings for parameter in each.parameters()}
+    tables = {id(parameter) for embedding in embeddings for parameter in embedding.parameters()}
     decayed: list[nn.Parameter] = []
     free: list[nn.Parameter] = []
     for parameter in module.parameters():

@@ -85,15 +85,18 @@ def _differences(run: RunFolder, recipe: Recipe, card: DatasetCard, last: Path |
     if last is not None:
         recipe = with_recorded_precision(recipe, started, last)
         started = with_recorded_precision(started, started, last)
-    found = recipe_differences(started, recipe)
-    found = [each for each in found if not each.startswith("data.path ")]
+    changes = recipe_differences(started, recipe)
+    changes = [change for change in changes if not change.startswith("data.path ")]
     before = DatasetCard.read(run.card)
     if before.has_data_of(card):
         scene = before.environment.contradictions(card.environment)
-        return [*found, *(f"the dataset's card says otherwise of its {name} now" for name in scene)]
-    others = [each for each in before.differences(card) if not each.startswith("source.")]
+        return [
+            *changes,
+            *(f"the dataset's card says otherwise of its {name} now" for name in scene),
+        ]
+    others = [change for change in before.differences(card) if not change.startswith("source.")]
     why = few(others, 1) if others else "other recordings"
-    return [*found, f"{recipe.data['path']} holds other data ({why})"]
+    return [*changes, f"{recipe.data['path']} holds other data ({why})"]
 
 
 @contextlib.contextmanager

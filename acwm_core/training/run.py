@@ -116,11 +116,11 @@ def check_savable(state: Mapping[str, Any]) -> None:
 
 def digest(weights: Mapping[str, Tensor]) -> str:
     """SHA-256 of tensors with their names, types and shapes, without the file's header."""
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for name, value in sorted(weights.items()):
-        found.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        found.update(cast(Any, value.contiguous().flatten().view(torch.uint8).numpy()))
-    return found.hexdigest()
+        sha256.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        sha256.update(cast(Any, value.contiguous().flatten().view(torch.uint8).numpy()))
+    return sha256.hexdigest()
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
@@ -158,11 +158,11 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
         )
     weights, expected = _upgraded(world_model, _stored(path, facts)), _trained(world_model)
     for name in sorted({*weights, *expected}):
-        found = tuple(weights[name].shape) if name in weights else "missing"
+        shape = tuple(weights[name].shape) if name in weights else "missing"
         wanted = tuple(expected[name].shape) if name in expected else "absent"
-        if found != wanted:
+        if shape != wanted:
             raise TrainingError(
-                f"{path} does not fit the recipe: {name} is {found}, the model expects {wanted}"
+                f"{path} does not fit the recipe: {name} is {shape}, the model expects {wanted}"
             )
     _take(expected, weights)
 
@@ -245,5 +245,5 @@ def all_training(name: str, run: RunFolder) -> dict[str, Any]:
     """
     facts = read_metadata(run.weights) | training_of(run)
     earlier: dict[str, Any] = facts.get("init_from") or {}
-    sums = {each: facts.get(each, 0) + earlier.get(each, 0) for each in ("step", "cpu_seconds")}
+    sums = {name: facts.get(name, 0) + earlier.get(name, 0) for name in ("step", "cpu_seconds")}
     return {"name": Path(name).name, **sums}

@@ -79,7 +79,7 @@ def resume_command(run: RunFolder) -> str:
 
 def trained_models() -> list[str]:
     """The names of the installed trained models."""
-    return [each.name for each in catalog().registry("trained_model") if not each.requires]
+    return [model.name for model in catalog().registry("trained_model") if not model.requires]
 
 
 def find_run(name: str | Path) -> Path:

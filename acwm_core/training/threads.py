@@ -25,7 +25,7 @@ def idle_cores() -> float:
 
     def idle_seconds() -> float:
         counts = [line.split() for line in STAT.read_text(encoding="utf-8").splitlines()]
-        ticks = sum(int(each[4]) + int(each[5]) for each in counts if each[0] in own)
+        ticks = sum(int(count[4]) + int(count[5]) for count in counts if count[0] in own)
         return ticks / os.sysconf("SC_CLK_TCK")
 
     before, started = idle_seconds(), time.monotonic()

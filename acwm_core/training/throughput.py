@@ -82,8 +82,8 @@ class Throughput(Callback):
             "frames_per_second": self._seen,
         }
         if self._peak:
-            made = self._operations * self._seen / self._frames
-            speeds["model_flops_utilisation"] = made / self._peak
+            operations = self._operations * self._seen / self._frames
+            speeds["model_flops_utilisation"] = operations / self._peak
         for logger in trainer.loggers:
             named = {SPEED + name: value / seconds for name, value in speeds.items()}
             logger.log_metrics(named, step=trainer.global_step - 1)
@@ -102,10 +102,10 @@ def operations(world_model: WorldModel, frames: int, frame_size: tuple[int, int]
     """
     tensors = [*world_model.parameters(), *world_model.buffers()]
     memo: dict[int, Any] = {id(world_model.codec): world_model.codec}
-    for each in tensors:
-        empty = torch.empty_like(each, device="meta")
-        is_weight = isinstance(each, nn.Parameter)
-        memo[id(each)] = nn.Parameter(empty, each.requires_grad) if is_weight else empty
+    for tensor in tensors:
+        empty = torch.empty_like(tensor, device="meta")
+        is_weight = isinstance(tensor, nn.Parameter)
+        memo[id(tensor)] = nn.Parameter(empty, tensor.requires_grad) if is_weight else empty
     counted = copy.deepcopy(world_model, memo)
     codec = world_model.codec
     shape = (1, codec.latent_frames(frames), codec.channels, *codec.latent_size(*frame_size))

@@ -46,7 +46,7 @@ def build_trainer(
         TrainingError: flags that this training does not support.
     """
     if not isinstance(flags.get("logger"), bool | None):  # names are among `loggers`
-        others = [each for each in chosen_loggers(flags) if not isinstance(each, str)]
+        others = [logger for logger in chosen_loggers(flags) if not isinstance(logger, str)]
         flags = {**flags, "logger": others}
     chosen = instantiate_flags(flags)
     _check_saves(chosen)
@@ -103,10 +103,10 @@ def instantiate_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             parsed = parser.parse_object({"trainer": copy.deepcopy(dict(flags))})  # it changes them
-            made = parser.instantiate(parsed)
+            instantiated = parser.instantiate(parsed)
     except (ArgumentError, ValueError, TypeError, ImportError) as error:
         raise RecipeError(f"invalid section trainer: {one_line(error)}") from None
-    values = cast(dict[str, Any], made["trainer"].as_dict())
+    values = cast(dict[str, Any], instantiated["trainer"].as_dict())
     return {name: values[name] for name in flags}
 
 
@@ -126,8 +126,8 @@ def one_line(error: BaseException) -> str:
     message = str(error)
     if about := re.match(r'Parser key "(.+?)":(.*)', message, re.DOTALL):
         key, what = about.groups()
-        _, found, reasons = what.partition("Errors:")
-        if found:
+        _, separator, reasons = what.partition("Errors:")
+        if separator:
             values = re.findall(r"typing\.Literal\[(.*?)\]", reasons)
             first = reasons.strip().removeprefix("- ").split("\n    - ")[0]
             what = f"expected one of {', '.join(values)}" if values else first
@@ -172,11 +172,11 @@ def _check_saves(flags: Mapping[str, Any]) -> None:
 
 
 def _check_flags(flags: Mapping[str, Any], config: TrainingConfig) -> None:
-    found = torch.cuda.is_available() or torch.backends.mps.is_available()
+    has_gpu = torch.cuda.is_available() or torch.backends.mps.is_available()
     is_endless = flags.get("max_steps") in (None, -1)
     for wrong, message in (
         (
-            flags.get("accelerator") in ("gpu", "cuda") and not found,
+            flags.get("accelerator") in ("gpu", "cuda") and not has_gpu,
             "PyTorch finds no GPU here: train on the CPU with "
             "trainer.accelerator=cpu trainer.devices=1, or use +small",
         ),

@@ -21,7 +21,7 @@ from acwm_core.evaluation.predict import Evaluator
 from acwm_core.evaluation.results import Counterfactual, ResponseCurve
 from acwm_core.evaluation.statistics import ClipScores, Estimate, finite
 from acwm_core.evaluation.summarise import summary_of
-from acwm_core.evaluation.videos import ShownClip, shown
+from acwm_core.evaluation.videos import ClipVideo, video_of
 from acwm_interventions.simulations import Again, simulate_again
 
 SIZES = (0.1, 0.5)
@@ -134,13 +134,13 @@ def simulate_branches(
 
 def counterfactual(
     evaluator: Evaluator, metrics: Mapping[str, Metric], simulated: Iterable[Simulated]
-) -> tuple[Counterfactual, list[ShownClip]]:
+) -> tuple[Counterfactual, list[ClipVideo]]:
     """Predict the clips of a split and their branches with the same noise; compare the responses.
 
     Returns the results, and videos of the first clip and its branches (only the largest shifts).
     """
     responses = ActionResponses(metrics, evaluator.card.action, evaluator.config.seed)
-    videos: list[ShownClip] = []
+    videos: list[ClipVideo] = []
     for branches, truth in simulated:
         for row in ROWS:
             if row not in evaluator.rows:
@@ -164,7 +164,7 @@ def _predicted(evaluator: Evaluator, truth: Prediction, row: Predictor) -> Predi
     return replace(made[0], branches=tuple(made[1:])).without(truth.clip.given - 1)
 
 
-def _videos(prediction: Prediction, branches: Sequence[Branch]) -> list[ShownClip]:
+def _videos(prediction: Prediction, branches: Sequence[Branch]) -> list[ClipVideo]:
     largest = max((branch.size for branch in branches), default=0.0)
     named = [("factual", prediction)] + [
         (branch.kind, each)
@@ -173,7 +173,7 @@ def _videos(prediction: Prediction, branches: Sequence[Branch]) -> list[ShownCli
     ]
     clip = prediction.clip
     return [
-        shown(
+        video_of(
             each,
             f"{clip.split}-{clip.episode:06d}-branch-{number:02d}.mp4",
             kind=f"branch:{kind}",

@@ -22,7 +22,7 @@ from acwm_core.evaluation.results import Counterfactual, Ensemble, Predictabilit
 from acwm_core.evaluation.score import build_metrics, score, split_available
 from acwm_core.evaluation.statistics import finite
 from acwm_core.evaluation.study import Clips
-from acwm_core.evaluation.videos import ShownClip
+from acwm_core.evaluation.videos import ClipVideo
 from acwm_core.model.world_model import CLIP_FRAMES
 from acwm_interventions.counterfactual import (
     ROWS,
@@ -57,7 +57,7 @@ class Interventions:
     predictability: dict[str, Predictability] = field(default_factory=dict[str, Predictability])
     counterfactual: dict[str, Counterfactual] = field(default_factory=dict[str, Counterfactual])
     ensembles: dict[str, Ensemble] = field(default_factory=dict[str, Ensemble])
-    videos: list[ShownClip] = field(default_factory=list[ShownClip])
+    videos: list[ClipVideo] = field(default_factory=list[ClipVideo])
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
 

@@ -17,10 +17,12 @@ def test_the_report_covers_this_installation(
     """One of the engines really starts; the conformance tests start all in fresh processes."""
     tried: dict[str, str] = {}
 
-    def trial(component: Component) -> doctor.Finding:
+    def trial(component: Component) -> doctor.Diagnosis:
         tried[component.requires or component.target.partition(":")[0]] = component.name
         started = component.name == "push_cube"
-        return original(component) if started else doctor.Finding(component.name, True, "left out")
+        return (
+            original(component) if started else doctor.Diagnosis(component.name, True, "left out")
+        )
 
     original = doctor.trial
     monkeypatch.setattr(doctor, "trial", trial)
@@ -37,11 +39,11 @@ def test_engines_are_started_side_by_side_and_once_each(monkeypatch: pytest.Monk
     monkeypatch.setattr("acwm_core.executors.available_cores", lambda: 8)
     everyone, tried = threading.Barrier(8, timeout=600), list[str]()
 
-    def trial(component: Component) -> doctor.Finding:
+    def trial(component: Component) -> doctor.Diagnosis:
         tried.append(component.name)
         if component.name.startswith("e"):
             everyone.wait()  # for ever, unless all are tried at once
-        return doctor.Finding(f"environment {component.name}", True, "simulates")
+        return doctor.Diagnosis(f"environment {component.name}", True, "simulates")
 
     def registry(kind: str) -> list[Component]:
         names = _names() * (kind == "environment")
@@ -67,7 +69,7 @@ def test_an_engine_that_is_not_installed() -> None:
     component = Component(
         "environment", "e", "x:Y", "p", "dist", extra="sim", requires=("no_such_engine",)
     )
-    assert doctor.trial(component) == doctor.Finding(
+    assert doctor.trial(component) == doctor.Diagnosis(
         "environment e", None, "needs no_such_engine: pip install 'dist[sim]'"
     )
 
@@ -96,7 +98,10 @@ def test_an_engine_that_does_not_work(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_exit_code_tells_that_something_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = [doctor.Finding("engine", False, "broken"), doctor.Finding("other", None, "absent")]
+    broken = [
+        doctor.Diagnosis("engine", False, "broken"),
+        doctor.Diagnosis("other", None, "absent"),
+    ]
     monkeypatch.setattr(doctor, "findings", lambda: broken)
     result = CliRunner().invoke(main, ["doctor"])
     assert result.exit_code == 1

@@ -10,7 +10,7 @@ from acwm_core.model.objectives.flow import FlowMatching, FlowStream
 from acwm_core.model.shapes import Latent, Sigmas
 
 
-class _Stream(FlowStream["DiffusionForcing"]):
+class _DiffusionForcingStream(FlowStream["DiffusionForcing"]):
     """Samples latent frames one after the other, each with the cached past.
 
     A finished latent frame is evaluated once more, clean, so that later frames can attend to it.
@@ -49,4 +49,4 @@ class DiffusionForcing(FlowMatching):
     """
 
     causal = True
-    streams_as = _Stream
+    streams_as = _DiffusionForcingStream

@@ -182,9 +182,9 @@ class FlowMatching(Objective[Denoiser]):
             known: number of first latent frames that are given.
         """
         frames = clean.shape[1] - known
-        drawn = torch.stack([self.draw(frames, generator) for generator in generators])
+        indices = torch.stack([self.draw(frames, generator) for generator in generators])
         noise = to_device(noise_of_clips(clean.shape[1:], generators), clean)
-        sigma = to_device(torch.nn.functional.pad(self._sigmas[drawn], (known, 0)), clean)
+        sigma = to_device(torch.nn.functional.pad(self._sigmas[indices], (known, 0)), clean)
         noisy = mix(clean, noise, sigma)
         prediction = evaluate(noisy, sigma).float()
         if self.loss_on == "clean":
@@ -192,7 +192,7 @@ class FlowMatching(Objective[Denoiser]):
         else:
             error = self.to_velocity(prediction, noisy, sigma) - (noise - clean)
         per_frame = error[:, known:].square().flatten(2).mean(2)
-        return (per_frame * to_device(self._weights[drawn], per_frame)).mean()
+        return (per_frame * to_device(self._weights[indices], per_frame)).mean()
 
     def sample(
         self,
@@ -245,9 +245,9 @@ def evaluation(model: Denoiser, conditioning: Conditioning, **inputs: Tensor) ->
     """The network with everything that stays the same at all noise levels."""
 
     def evaluate(noisy: Latent, sigma: Sigmas) -> Latent:
-        made = model(noisy, sigma, conditioning, **inputs)
-        check_shape(model, "forward", made, *noisy.shape)
-        return made
+        predicted = model(noisy, sigma, conditioning, **inputs)
+        check_shape(model, "forward", predicted, *noisy.shape)
+        return predicted
 
     return evaluate
 

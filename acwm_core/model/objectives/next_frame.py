@@ -23,7 +23,7 @@ from acwm_core.model.objectives.flow import Evaluate, FlowMatching, FlowStream, 
 from acwm_core.model.shapes import Latent, Sigmas
 
 
-class _Stream(FlowStream["NextFrame"]):
+class _NextFrameStream(FlowStream["NextFrame"]):
     """Samples latent frames one after the other; each gets the previous frame as input.
 
     In the cache, later frames see a frame as it was evaluated last, still noisy, as in training.
@@ -74,7 +74,7 @@ class NextFrame(FlowMatching):
     """
 
     causal = True
-    streams_as = _Stream
+    streams_as = _NextFrameStream
     inputs: Mapping[str, InputKind] = {"previous": "latent", "previous_sigma": "level"}
 
     def __init__(self, *, past_noise: float = 0.3, own_past: float = 0.0, **flow: Any) -> None:
@@ -89,7 +89,7 @@ class NextFrame(FlowMatching):
         """The error of one evaluation after a past that is clean, noisy or the model's own."""
         latents, generators, frames = batch.latents, batch.generators, batch.latents.shape[1]
         past = self._past(model, batch, known)
-        levels = torch.stack([torch.rand(frames, generator=each) for each in generators])
+        levels = torch.stack([torch.rand(frames, generator=generator) for generator in generators])
         noise = batch.noise(frames)
         sigma = to_device(levels * self.past_noise, latents)
         previous = mix(frames_before(past), noise, sigma)
