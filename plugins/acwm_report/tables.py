@@ -25,11 +25,13 @@ from acwm_report.table import MISSING, PERCENT, PLAIN, Cell, Column, Row, Scale,
 from acwm_report.titles import (
     COLUMNS,
     ENSEMBLE_ROWS,
+    OVER,
     ROWS,
     branch_title,
     clips_title,
     counted,
     label_title,
+    short_title,
     split_title,
 )
 from acwm_report.videos import EmbeddedVideo
@@ -64,12 +66,12 @@ def _score_rows(
     """The scores of a split in one view; ``""`` is the whole frame."""
     result = run.summary.splits[split].scores
     names = {of_view(name, view): scale for name, scale in scales.items()}
-    for kind, (row, _, note) in ROWS.items():
+    for kind, row in ROWS.items():
         scores = result.rows.get(kind, {})
         cells = [Cell.of(scores.get(name), scale) for name, scale in names.items()]
         if any(cell.value is not None for cell in cells):
-            note = result.failures(kind) or note
-            yield Row(row, cells, note, kind, strong=kind == "model", group=view)
+            note = result.failures(kind) or row.about
+            yield Row(row.title, cells, note, kind, strong=kind == "model", group=view)
     if split == "ood_test" and run.summary.gap:
         change = run.summary.gap["model"]
         cells = [Cell.of(change.get(name), scale, signed=True) for name, scale in names.items()]
@@ -178,9 +180,9 @@ def label_tables(run: EvaluatedRun) -> list[Table]:
         return []
     name, scale = run.summary.headline, run.headline_scale()
     first = groups[0][1]
-    over = {"copy": "above first frame", "shuffled": "above other actions"}
     columns = [Column("Number"), Column(run.headline.title, scale.unit)]
-    columns += [Column(title, scale.unit) for each, title in over.items() if each in first.paired]
+    baselines = [short_title(row) for row in OVER if row in first.paired]
+    columns += [Column(f"above {title}", scale.unit) for title in baselines]
     columns += [Column("true actions better")] * ("shuffled" in first.paired)
     columns += [Column("Codec bound", scale.unit)] * ("codec" in first.rows)
     rows: list[Row] = []
@@ -209,7 +211,8 @@ def episode_table(run: EvaluatedRun, videos: Sequence[EmbeddedVideo] = ()) -> Ta
     columns += [Column("From frame", key="start")] * windows + [Column("Video", key="video")]
     key = f"{headline}_over_other_actions"
     others = {_clip(r): r.values[headline] for r in run.results if r.kind == "shuffled"}
-    columns += [Column("above other actions", scales[headline].unit, key=key)] * bool(others)
+    above = Column(f"above {short_title('shuffled')}", scales[headline].unit, key=key)
+    columns += [above] * bool(others)
     columns += [Column.of(info, scales[name], name) for name, info in summary.metrics.items()]
     links = {_clip(each.record): each.key for each in videos if each.record.kind == "model"}
     splits = list(summary.splits)

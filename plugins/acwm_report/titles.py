@@ -21,6 +21,7 @@ class RowTitle(NamedTuple):
     title: str  # of a line in a table
     short: str  # of a column, and on the terminal
     about: str
+    over: str = ""  # of a baseline that the model is compared with on each clip: what it is
 
 
 ROWS = {
@@ -39,9 +40,14 @@ ROWS = {
         "Model, best of draws", "best draw", "the best draw of each clip in each metric"
     ),
     "shuffled": RowTitle(
-        "Model, other actions", "other actions", "same model and noise, another episode’s actions"
+        "Model, other actions",
+        "other actions",
+        "same model and noise, another episode’s actions",
+        "the same model with other actions",
     ),
-    "copy": RowTitle("First frame, repeated", "first frame", "nothing moves"),
+    "copy": RowTitle(
+        "First frame, repeated", "first frame", "nothing moves", "the repeated first frame"
+    ),
 }
 """The names of every row of an evaluation, in table order."""
 
@@ -55,14 +61,14 @@ COLUMNS = (
 
 ENSEMBLE_ROWS = {
     "simulator": ("Simulator", "floor: one half of its futures against the other"),
-    "codec": ("Codec reconstruction", "of the simulator’s futures: lower bound on this codec"),
-    "model": ("Model", "the evaluated model"),
-    "copy": ("First frame, repeated", "nothing moves"),
+    "codec": (ROWS["codec"].title, "of the simulator’s futures: lower bound on this codec"),
+    "model": ("Model", ROWS["model"].about),
+    "copy": (ROWS["copy"].title, ROWS["copy"].about),
 }
 """Title and explanation of what is compared with the simulator's futures, in table order."""
 
 
-OVER = {"copy": "the repeated first frame", "shuffled": "the same model with other actions"}
+OVER = {name: ROWS[name].over for name in ("copy", "shuffled")}
 """The baselines that a model is compared with on each clip."""
 
 
