@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from acwm_benchmark.tasks import BENCHMARK, README, SUMS, Task, Tasks, World, write_index
+from acwm_benchmark.tasks import (
+    BENCHMARK,
+    README,
+    SUMS,
+    BenchmarkTask,
+    BenchmarkWorld,
+    Tasks,
+    write_index,
+)
 from acwm_benchmark.truth import TESTS, datasets_in, simulate, truth_beside
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
@@ -141,7 +149,7 @@ def _simulate(name: str, out: Path, size: Any, episodes: int, seed: int, *more: 
 
 def _export_world(
     path: Path, folder: Path, config: EvaluationConfig, seed: int | None
-) -> tuple[World, list[Task]]:
+) -> tuple[BenchmarkWorld, list[BenchmarkTask]]:
     """Write the tasks of one dataset; `seed` is None if the data was not simulated for them."""
     card = DatasetCard.read(path)
     environment, name = card.environment, card.environment.name
@@ -160,7 +168,7 @@ def _export_world(
         episodes=None if whole else config.episodes,  # then tasks of all are called so
         counterfactual_episodes=config.counterfactual_episodes if branches else 0,
     )
-    world = World(
+    world = BenchmarkWorld(
         name=name,
         summary=environment.summary,
         size=environment.frame_size,
@@ -213,14 +221,14 @@ def _name(world: str, clip: Clip) -> str:
     return f"{world}/{clip.split}-{clip.episode:06d}{start}"
 
 
-def _write(folder: Path, world: str, given: Given) -> Task:
+def _write(folder: Path, world: str, given: Given) -> BenchmarkTask:
     several = len(given.frames) > 1
     images = [f"{given.id}{f'-{n}' * several}.png" for n in range(len(given.frames))]
     for name, frame in zip(images, given.frames, strict=True):
         Image.fromarray(frame).save(folder / name)
     actions = f"{given.id}.npz"
     np.savez_compressed(folder / actions, actions=given.actions)
-    return Task(
+    return BenchmarkTask(
         id=given.id,
         world=world,
         frames=len(given.actions),
@@ -232,7 +240,9 @@ def _write(folder: Path, world: str, given: Given) -> Task:
     )
 
 
-def _write_readme(folder: Path, worlds: Mapping[str, World], tasks: Sequence[Task]) -> None:
+def _write_readme(
+    folder: Path, worlds: Mapping[str, BenchmarkWorld], tasks: Sequence[BenchmarkTask]
+) -> None:
     text = resources.files("acwm_benchmark").joinpath("tasks.md.j2").read_text("utf-8")
     page = jinja2.Environment(
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -70,7 +70,7 @@ ENCODERS = {
 """How to encode as a file is coded, by FFmpeg's name of the codec."""
 
 
-class Sample(NamedTuple):
+class LossyClip(NamedTuple):
     """A file that was handed in: its size in bytes, and its frames `[T, H, W, 3]` in [0, 1]."""
 
     size: int
@@ -101,7 +101,7 @@ class LossyVideo:
         DataError: acwm cannot encode so.
     """
 
-    def __init__(self, coding: Coding, samples: Iterable[Sample], fps: float) -> None:
+    def __init__(self, coding: Coding, samples: Iterable[LossyClip], fps: float) -> None:
         self.coding, self.fps = coding, fps
         name = coding.codec.removeprefix("lib").partition("_")[0]
         name = {"dav1d": "av1", "vpx-vp9": "vp9", "aom-av1": "av1"}.get(name, name)
@@ -139,7 +139,7 @@ class LossyVideo:
         with scheduling_kept():
             return encode_frames(frames, frames.shape[1:3], encoding, self.fps, KEYFRAMES)
 
-    def _median_quality(self, samples: Iterable[Sample], encoder: Encoder) -> int:
+    def _median_quality(self, samples: Iterable[LossyClip], encoder: Encoder) -> int:
         if encoder.best == encoder.worst:
             return encoder.best
         found: list[int] = []
@@ -148,7 +148,7 @@ class LossyVideo:
             found.append(self._quality_of(sample, encoder, near))
         return statistics.median_low(found)
 
-    def _quality_of(self, sample: Sample, encoder: Encoder, near: int) -> int:
+    def _quality_of(self, sample: LossyClip, encoder: Encoder, near: int) -> int:
         """The lowest quality at which the sample is still as large as its file.
 
         The search widens from `near`, because files of one encoder are alike.

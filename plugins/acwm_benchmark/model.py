@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from acwm_benchmark.lossy import Lossless, LossyVideo
 from acwm_benchmark.predictions import Predictions
-from acwm_benchmark.tasks import Task, Tasks
+from acwm_benchmark.tasks import BenchmarkTask, Tasks
 from acwm_core.errors import DataError
 from acwm_core.evaluation.clips import draw_seeds
 from acwm_core.model.shapes import Actions, Video
@@ -41,7 +41,7 @@ class HandedIn:
         self.samples = predictions.draws > 1
         self._predictions = predictions
         self._span = np.subtract(world.actions["high"], world.actions["low"])
-        self._known: dict[int, list[tuple[Task, int, NDArray[np.float32]]]] = {}
+        self._known: dict[int, list[tuple[BenchmarkTask, int, NDArray[np.float32]]]] = {}
         for task in predictions.tasks.values():
             actions = tasks.actions(task)
             for draw, seed in enumerate(draw_seeds(task.seed, len(predictions.files[task.id]))):

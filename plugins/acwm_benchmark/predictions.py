@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from acwm_benchmark.lossy import Sample
-from acwm_benchmark.tasks import Task, World
+from acwm_benchmark.lossy import LossyClip
+from acwm_benchmark.tasks import BenchmarkTask, BenchmarkWorld
 from acwm_benchmark.videos import CONTAINERS, NPZ, Coding, coding_of, pictures_in, read_whole
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, suggest
@@ -31,8 +31,8 @@ class Predictions:
     """The predictions of one world's tasks: for each id the file or folder of each draw."""
 
     folder: Path
-    world: World
-    tasks: Mapping[str, Task]
+    world: BenchmarkWorld
+    tasks: Mapping[str, BenchmarkTask]
     files: Mapping[str, Sequence[Path]]
 
     @property
@@ -53,11 +53,11 @@ class Predictions:
                 )
         return found
 
-    def samples(self) -> Iterator[Sample]:
+    def samples(self) -> Iterator[LossyClip]:
         """All videos with the sizes of their files."""
         for task, paths in self.files.items():
             for draw, path in enumerate(paths):
-                yield Sample(path.stat().st_size, self.video(task, draw))
+                yield LossyClip(path.stat().st_size, self.video(task, draw))
 
     @cached_property
     def checksum(self) -> str:
@@ -92,7 +92,9 @@ class Predictions:
         _refuse(faults)
 
 
-def find_predictions(folder: Path, world: World, tasks: Sequence[Task]) -> Predictions:
+def find_predictions(
+    folder: Path, world: BenchmarkWorld, tasks: Sequence[BenchmarkTask]
+) -> Predictions:
     """Find the predictions of a world's tasks below a folder.
 
     Raises:
@@ -151,7 +153,9 @@ def _named(path: Path, world: str, wanted: Iterable[str]) -> tuple[str, int]:
     return (draw[1], int(draw[2])) if draw and task not in wanted else (task, 0)
 
 
-def _of_draws(found: Mapping[str, Mapping[int, Path]], tasks: Mapping[str, Task]) -> list[str]:
+def _of_draws(
+    found: Mapping[str, Mapping[int, Path]], tasks: Mapping[str, BenchmarkTask]
+) -> list[str]:
     counts = Counter(len(each) for name, each in found.items() if not tasks[name].branch)
     usual = counts.most_common(1)[0][0] if counts else 1
     wrong = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from acwm_benchmark.model import HandedIn
 from acwm_benchmark.predictions import Predictions, find_predictions
-from acwm_benchmark.tasks import BENCHMARK, Tasks, World
+from acwm_benchmark.tasks import BENCHMARK, BenchmarkWorld, Tasks
 from acwm_benchmark.truth import truth_beside, truth_of
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError, RecipeError
@@ -110,7 +110,7 @@ def _score(
     return evaluate_clips(evaluator, datasets, home, entrant, studies=STUDIES, **how)
 
 
-def settings_of(world: World, tasks: Tasks) -> EvaluationConfig:
+def settings_of(world: BenchmarkWorld, tasks: Tasks) -> EvaluationConfig:
     """The settings of a world's evaluation; those of a file run no code."""
     settings = {"evaluation": world.evaluation}
     origin = tasks.folder / BENCHMARK

@@ -30,7 +30,7 @@ OVERHEAD = 2**20
 
 
 @dataclass(frozen=True)
-class World:
+class BenchmarkWorld:
     """One world of a benchmark, without its tasks.
 
     Attributes:
@@ -66,7 +66,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class Task:
+class BenchmarkTask:
     """One clip to predict: a line of the index.
 
     Attributes:
@@ -95,7 +95,7 @@ class Task:
 class Benchmark:
     """``benchmark.json``: all worlds by name, and the version of the layout."""
 
-    worlds: dict[str, World]
+    worlds: dict[str, BenchmarkWorld]
     version: int = 1
 
     def __post_init__(self) -> None:
@@ -123,13 +123,13 @@ class Tasks:
         index = regular_file(self.folder, INDEX)
         try:
             lines = index.read_text(encoding="utf-8").splitlines()
-            self.all = [typed(parse_json(line), Task) for line in lines]
+            self.all = [typed(parse_json(line), BenchmarkTask) for line in lines]
             for task in self.all:
                 self._check(task)
         except ValueError as error:
             raise DataError(f"{index} is damaged ({error})") from error
 
-    def _check(self, task: Task) -> None:
+    def _check(self, task: BenchmarkTask) -> None:
         if task.world not in self.benchmark.worlds:
             raise ValueError(f"{BENCHMARK} has no world {task.world!r}")
         world, _, name = task.id.partition("/")
@@ -142,7 +142,7 @@ class Tasks:
         """SHA-256 of the index."""
         return file_sha256(self.folder / INDEX)
 
-    def worlds(self, names: Sequence[str] = ()) -> list[World]:
+    def worlds(self, names: Sequence[str] = ()) -> list[BenchmarkWorld]:
         """The worlds with these names, all by default; a `DataError` for others."""
         known = self.benchmark.worlds
         for name in names:
@@ -155,11 +155,11 @@ class Tasks:
                 raise DataError(f"{self.folder} has no tasks of {name!r}{suggest(name, known)}")
         return [known[name] for name in (names or known)]
 
-    def of(self, world: str) -> list[Task]:
+    def of(self, world: str) -> list[BenchmarkTask]:
         """The tasks of a world."""
         return [task for task in self.all if task.world == world]
 
-    def actions(self, task: Task) -> NDArray[np.float32]:
+    def actions(self, task: BenchmarkTask) -> NDArray[np.float32]:
         """The actions of a task, `[T, A]`."""
         wanted = task.frames, len(self.benchmark.worlds[task.world].actions["names"])
 
@@ -204,7 +204,9 @@ def read_array(
     return arrays[name]
 
 
-def write_index(folder: Path, worlds: Mapping[str, World], tasks: Iterable[Task]) -> None:
+def write_index(
+    folder: Path, worlds: Mapping[str, BenchmarkWorld], tasks: Iterable[BenchmarkTask]
+) -> None:
     """Write ``benchmark.json``, the index and, last, the checksums of all files."""
     text = json.dumps(asdict(Benchmark(dict(worlds))), indent=1, ensure_ascii=False)
     (folder / BENCHMARK).write_text(text + "\n", encoding="utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from acwm_benchmark.tasks import World
+from acwm_benchmark.tasks import BenchmarkWorld
 from acwm_core.data.card import CARD, DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
@@ -37,7 +37,7 @@ def datasets_in(folder: Path) -> dict[str, Path]:
 
 
 def truth_of(
-    world: World, folder: Path, workers: int | None, progress: bool
+    world: BenchmarkWorld, folder: Path, workers: int | None, progress: bool
 ) -> dict[str, EpisodeDataset]:
     """The true test splits of a world; simulated into `folder` if they are not there.
 
@@ -61,7 +61,7 @@ def truth_of(
     return datasets
 
 
-def _simulated(world: World, folder: Path, workers: int | None, progress: bool) -> Path:
+def _simulated(world: BenchmarkWorld, folder: Path, workers: int | None, progress: bool) -> Path:
     if world.source:
         recorded = f"{world.source['kind']} {world.source['name']}"
         raise DataError(

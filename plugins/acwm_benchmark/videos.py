@@ -14,7 +14,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from acwm_benchmark.tasks import World, read_array
+from acwm_benchmark.tasks import BenchmarkWorld, read_array
 from acwm_core.errors import DataError
 from acwm_formats.frames import VideoFrames, opened_video
 from acwm_formats.names import natural
@@ -82,7 +82,7 @@ def coding_of(path: Path) -> Coding | None:
         return Coding(stream.codec_context.name, stream.codec_context.pix_fmt)
 
 
-def read_whole(path: Path, task: str, frames: int, world: World) -> NDArray[np.float32]:
+def read_whole(path: Path, task: str, frames: int, world: BenchmarkWorld) -> NDArray[np.float32]:
     """Read a prediction, `[T, H, W, 3]` in [0, 1], and check it against its task.
 
     Raises:

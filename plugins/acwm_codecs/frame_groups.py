@@ -40,7 +40,7 @@ class Source:
     predicted: list[NDArray[np.float16]] = field(default_factory=list[NDArray[np.float16]])
 
 
-class Group(NamedTuple):
+class FrameGroup(NamedTuple):
     """Four frames of a video, `[12, 64, 64]`, and what they are decoded from.
 
     Attributes:
@@ -90,7 +90,7 @@ def load_videos(folder: Path, most: int) -> Videos:
     return [np.ascontiguousarray(video.transpose(0, 2, 3, 1)) for video in videos]
 
 
-def random_group(source: Source, rng: np.random.Generator) -> Group:
+def random_group(source: Source, rng: np.random.Generator) -> FrameGroup:
     """One group; an augmented one, if its latents are to be the codec's own."""
     index = int(rng.integers(len(source.videos)))
     video = source.videos[index]
@@ -104,12 +104,12 @@ def random_group(source: Source, rng: np.random.Generator) -> Group:
     if rng.random() < STRANGE_FRACTION:
         shown = shown[:, :: rng.choice([-1, 1]), :: rng.choice([-1, 1]), rng.permutation(3)]
     before = int(rng.integers(start + 1))
-    return Group(_folded(shown[list(frames)]), _folded(shown[before : before + 1]))
+    return FrameGroup(_folded(shown[list(frames)]), _folded(shown[before : before + 1]))
 
 
 def _predicted_group(
     video: NDArray[np.uint8], latents: NDArray[np.float16], rng: np.random.Generator
-) -> Group:
+) -> FrameGroup:
     """A group with the latents that a model predicts of it from the video's first frame."""
     height, width = video.shape[1:3]
     stride, frame = height // latents.shape[2], int(rng.integers(1, len(latents)))
@@ -118,7 +118,7 @@ def _predicted_group(
     top, left = y * stride, x * stride
     shown = video[:, top : top + CROP, left : left + CROP]
     first = 1 + STRIDE * (frame - 1)
-    return Group(
+    return FrameGroup(
         _folded(shown[first : first + STRIDE]),
         _folded(shown[:1]),
         latents[frame, :, y : y + cells, x : x + cells],

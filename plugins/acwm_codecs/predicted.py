@@ -21,7 +21,7 @@ from acwm_core.training.run import RunBundle, load_run, read_metadata
 from acwm_core.training.run_folder import RunFolder
 
 
-class Predictions:
+class EpisodePredictor:
     """Predicts the training episodes of datasets, each by the model of its world and frame size.
 
     Args:

@@ -29,7 +29,7 @@ from torch.nn import functional
 from acwm_codecs.compact import STRIDE, Compact, Fine
 from acwm_codecs.compact_reference import CompactReference
 from acwm_codecs.frame_groups import Groups, Source, load_videos, sample_groups
-from acwm_codecs.predicted import Predictions
+from acwm_codecs.predicted import EpisodePredictor
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
@@ -289,7 +289,7 @@ def train_on(
     trained = begun(kind, start, file)
     if freeze_coarse:
         _freeze_coarse(trained)
-    predictions = Predictions(predicted_by, trained)
+    predictions = EpisodePredictor(predicted_by, trained)
     loaded = {
         folder: Source(load_videos(folder, episodes), predictions.of(folder, episodes))
         for folder in dict.fromkeys(data)

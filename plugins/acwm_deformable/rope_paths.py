@@ -13,7 +13,7 @@ _CELL = 0.06  # grid spacing in metres
 _STEPS = [(dy, dx) for dy, dx in itertools.product((-1, 0, 1), repeat=2) if dy or dx]
 
 
-class Chart:
+class ClearanceGrid:
     """A grid of pole positions that are at least `reach` away from the rope.
 
     Args:

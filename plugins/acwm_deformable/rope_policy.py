@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.rope import NODES, POLE_ROOM, Rope
-from acwm_deformable.rope_paths import Chart
+from acwm_deformable.rope_paths import ClearanceGrid
 
 Point = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ class Pusher:
 
     def _plan(self) -> Push | None:
         """Choose one of several random pushes that can be started, preferably a near one."""
-        chart = Chart(self.rope.nodes, self.place, self._contact)
+        chart = ClearanceGrid(self.rope.nodes, self.place, self._contact)
         options = [self._propose() for _ in range(32)]
         cost = np.array([chart.cost(start) for start, _, _ in options])
         room = np.array([_room(start, heading) for start, heading, _ in options])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_deformable.rope import Rope
-from acwm_deformable.rope_paths import Chart
+from acwm_deformable.rope_paths import ClearanceGrid
 from acwm_deformable.rope_policy import Point, Pusher, ahead_of
 
 _CANDIDATES = 32
@@ -41,7 +41,7 @@ class Shaper(Pusher):
 
     def _best_push(self) -> Generator[Point]:
         """Execute the push that brings the rope nearest; wait a frame if none helps."""
-        chart = Chart(self.rope.nodes, self.place, self._contact)
+        chart = ClearanceGrid(self.rope.nodes, self.place, self._contact)
         best, plan = self._error(self.rope) - _GAIN, None
         for _ in range(_CANDIDATES):
             start, heading = self._aim()

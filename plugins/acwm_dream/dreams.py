@@ -27,8 +27,8 @@ from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (
     DatasetStarts,
+    DreamStart,
     SimulatorStarts,
-    Start,
     Starts,
     check_options,
     picture_start,
@@ -173,7 +173,7 @@ class Dreams:
             raise DataError("there is no dataset to start from: name one with data=")
         return DatasetStarts(EpisodeDataset(Path(folder), self._settings.split), self._given)
 
-    def start(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+    def start(self, rng: np.random.Generator, options: Mapping[str, Any]) -> DreamStart:
         """Draw a start, or make one from ``{"frame": picture, "goal": Goal or picture}``.
 
         Raises:
@@ -201,7 +201,7 @@ class Dreams:
         return Goal({n: values[0] for n, values in seen.states.items()}, seen.masks[0], picture)
 
     def restart(
-        self, which: Sequence[int], starts: Sequence[Start], seeds: Sequence[int]
+        self, which: Sequence[int], starts: Sequence[DreamStart], seeds: Sequence[int]
     ) -> StepResult:
         """Restart some episodes, each with noise from its own seed."""
         for group in self._groups:
@@ -238,7 +238,7 @@ class Dreams:
     def _shape(self) -> tuple[int, int, int]:
         return (*self.card.frame_size, 3)
 
-    def _open(self, starts: Sequence[Start], seeds: Sequence[int]) -> Stream:
+    def _open(self, starts: Sequence[DreamStart], seeds: Sequence[int]) -> Stream:
         device = self._world.action_low.device
         video = torch.stack([as_clip(start.frames) for start in starts]).to(device)
         between = torch.from_numpy(np.stack([start.actions for start in starts])).to(device)

@@ -16,7 +16,7 @@ from acwm_core.env.task import Goal, Task, TaskEnvironment
 from acwm_core.errors import DataError, RecipeError, noting, suggest
 
 
-class Start(NamedTuple):
+class DreamStart(NamedTuple):
     """What a model is given at the start."""
 
     frames: NDArray[np.uint8]  # `[K, H, W, 3]`; the last one is the current frame
@@ -34,7 +34,7 @@ class Starts(ABC):
     options: tuple[str, ...]
 
     @abstractmethod
-    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> DreamStart:
         """Draw a start.
 
         Raises:
@@ -60,7 +60,7 @@ class SimulatorStarts(Starts):
         self._inner, self._given = make_environment(card.name, {"size": card.frame_size}), given
         self._environment = self._inner if task is None else TaskEnvironment(self._inner, task)
 
-    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> DreamStart:
         """The options are those of `Environment.reset`."""
         with noting("when a dream begins", self._inner):
             seed = int(rng.integers(2**31))
@@ -71,7 +71,7 @@ class SimulatorStarts(Starts):
                 self._inner.advance(actions[-1])
                 frames.append(self._inner.render())
         between = np.array(actions, np.float32).reshape(-1, self._inner.card.action.size)
-        return Start(np.stack(frames), between, info.get("goal"))
+        return DreamStart(np.stack(frames), between, info.get("goal"))
 
     def close(self) -> None:
         self._inner.close()
@@ -92,7 +92,7 @@ class DatasetStarts(Starts):
     def __init__(self, episodes: EpisodeDataset, given: int) -> None:
         self._episodes, self._given = episodes, given
 
-    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Start:
+    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> DreamStart:
         """The option ``{"episode": number}`` selects an episode."""
         number = options.get("episode", int(rng.integers(len(self._episodes))))
         if not isinstance(number, int) or not 0 <= number < len(self._episodes):
@@ -104,7 +104,7 @@ class DatasetStarts(Starts):
             )
         state = {name: values[-1] for name, values in episode.states.items()}
         goal = Goal(state, episode.masks[-1], episode.video[-1])
-        return Start(episode.video[:given], episode.actions[: given - 1], goal)
+        return DreamStart(episode.video[:given], episode.actions[: given - 1], goal)
 
 
 def check_options(options: Mapping[str, Any], starts: Starts) -> None:
@@ -119,7 +119,7 @@ def check_options(options: Mapping[str, Any], starts: Starts) -> None:
             raise RecipeError(f"unknown option {name!r} of reset{suggest(name, names)}")
 
 
-def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | None) -> Start:
+def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | None) -> DreamStart:
     """Start from a picture, without motion, under the actions nearest to zero.
 
     Raises:
@@ -135,4 +135,4 @@ def picture_start(card: EnvironmentCard, given: int, frame: Any, goal: Goal | No
     low, high = card.action.low, card.action.high
     still = np.clip(np.zeros(card.action.size, np.float32), low, high, dtype=np.float32)
     frames = np.repeat(picture[None], given, 0)
-    return Start(frames, np.tile(still, (given - 1, 1)).reshape(-1, card.action.size), goal)
+    return DreamStart(frames, np.tile(still, (given - 1, 1)).reshape(-1, card.action.size), goal)

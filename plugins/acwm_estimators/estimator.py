@@ -17,9 +17,9 @@ from acwm_core.model.shapes import Clip
 from acwm_core.plugins import catalog
 from acwm_estimators.curve import evenly, trace
 from acwm_estimators.fitted import fitted_physics, layout_from_dict
-from acwm_estimators.layout import Curve, Layout, layout_of
+from acwm_estimators.layout import CurveField, Layout, layout_of
 from acwm_estimators.limits import limits_fingerprint, physics_of
-from acwm_estimators.network import Output, StateNetwork
+from acwm_estimators.network import NetworkOutput, StateNetwork
 from acwm_estimators.plugin import WEIGHTS
 from acwm_estimators.reading import states_of
 from acwm_estimators.targets import lifted
@@ -99,7 +99,7 @@ class NetworkEstimator(StateEstimator):
     @torch.inference_mode()
     def _read(self, frames: Clip) -> dict[str, NDArray[Any]]:
         with torch.autocast("cpu", enabled=False):
-            output: Output = self._network(frames)
+            output: NetworkOutput = self._network(frames)
             seen = (
                 output.logits_at(self.card.frame_size).max(1).indices
             )  # argmax takes 5 times as long
@@ -118,7 +118,7 @@ class NetworkEstimator(StateEstimator):
                 found[f"curve:{curve.field}"] = np.stack(traced)
         return found
 
-    def _traced(self, likely: NDArray[np.float32], curve: Curve) -> NDArray[np.float64]:
+    def _traced(self, likely: NDArray[np.float32], curve: CurveField) -> NDArray[np.float64]:
         """Nodes `[N, 2]` of a curve in m, from the likelihoods `[1 + I, h, w]` of all instances."""
         body, cover = (1 + self.instances.index(name) for name in (curve.instance, curve.cover))
         path = trace(likely[body].astype(np.float64), likely[cover].astype(np.float64))

@@ -23,7 +23,7 @@ MIN_SHARE = 0.65
 
 
 @dataclass(frozen=True)
-class Frames:
+class LabelledFrames:
     """Frames of one size.
 
     Attributes:
@@ -39,7 +39,7 @@ class Frames:
     targets: dict[str, NDArray[np.float32]]
 
 
-def load_frames(folder: Path, layout: Layout, most: int) -> Frames:
+def load_frames(folder: Path, layout: Layout, most: int) -> LabelledFrames:
     """Load the frames of up to `most` training episodes of a dataset.
 
     Raises:
@@ -48,20 +48,20 @@ def load_frames(folder: Path, layout: Layout, most: int) -> Frames:
     dataset = EpisodeDataset(folder, "train")
     card = dataset.card.environment
     classes = classes_of(card.instances, layout)
-    parts: list[Frames] = []
+    parts: list[LabelledFrames] = []
     for index in range(min(most, len(dataset))):
         episode: Episode = dataset[index]
         targets = targets_of(episode.states, episode.masks, layout, card)
         frames = len(episode.video)
         neighbours = np.append(np.arange(1, frames), frames - 2)
-        parts.append(Frames(episode.video, neighbours, classes[episode.masks], targets))
+        parts.append(LabelledFrames(episode.video, neighbours, classes[episode.masks], targets))
     return joined(parts)
 
 
-def joined(parts: Sequence[Frames]) -> Frames:
+def joined(parts: Sequence[LabelledFrames]) -> LabelledFrames:
     """Concatenate frames."""
     starts = np.cumsum([0, *(len(part.video) for part in parts[:-1])])
-    return Frames(
+    return LabelledFrames(
         np.concatenate([part.video for part in parts]),
         np.concatenate([part.neighbours + s for part, s in zip(parts, starts, strict=True)]),
         np.concatenate([part.masks for part in parts]),
@@ -77,7 +77,7 @@ def classes_of(instances: Sequence[str], layout: Layout) -> NDArray[np.uint8]:
     return classes
 
 
-def reconstructed(frames: Frames, codec: Any, clips: int, length: int) -> Frames:
+def reconstructed(frames: LabelledFrames, codec: Any, clips: int, length: int) -> LabelledFrames:
     """Reconstructions of evenly spaced clips by a codec, with the same masks and targets.
 
     Args:
@@ -95,7 +95,7 @@ def reconstructed(frames: Frames, codec: Any, clips: int, length: int) -> Frames
             seen = codec(clip[None])[0].clamp(0, 1).mul(255).round().byte()
             videos.append(seen.permute(0, 2, 3, 1).numpy())
     step = np.tile(np.append(np.arange(1, length), length - 2), clips)
-    return Frames(
+    return LabelledFrames(
         np.concatenate(videos),
         step + np.repeat(np.arange(clips) * length, length),
         frames.masks[chosen],
@@ -109,7 +109,7 @@ def as_video(frames: NDArray[np.uint8]) -> Tensor:
 
 
 def draw(
-    frames: Frames, count: int, rng: np.random.Generator
+    frames: LabelledFrames, count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Draw a batch of augmented frames `[N, 3, H, W]`, their classes `[N, H, W]` and targets."""
     chosen = rng.integers(len(frames.video), size=count)

@@ -46,7 +46,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Curve:
+class CurveField:
     """A long thin body, traced through its mask from one end to the other.
 
     Attributes:
@@ -145,7 +145,7 @@ class Layout:
     locals: tuple[Local, ...] = ()
     totals: tuple[str, ...] = ()
     surface: Surface | None = None
-    curves: tuple[Curve, ...] = ()
+    curves: tuple[CurveField, ...] = ()
 
 
 @cache
@@ -212,7 +212,7 @@ def _stack_cube(physics: Physics) -> Layout:
 
 def _push_rope(physics: Physics) -> Layout:
     rope = physics.fields["rope_position"]
-    curve = Curve(rope.name, "rope_length", "rope", "pole", plane=rope.height, end=0.035)
+    curve = CurveField(rope.name, "rope_length", "rope", "pole", plane=rope.height, end=0.035)
     return Layout(
         _camera(physics), ("rope", "pole"), (_points(physics, "pole_position"),), curves=(curve,)
     )

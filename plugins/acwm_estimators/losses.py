@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_estimators.layout import Layout
-from acwm_estimators.network import BLUR, HEIGHT, Output, cells
+from acwm_estimators.network import BLUR, HEIGHT, NetworkOutput, cells
 
 PIXELS = 128
 """Largest number of rows at which masks are compared in full."""
@@ -20,7 +20,7 @@ MARGIN = 0.2
 
 
 def losses(
-    output: Output,
+    output: NetworkOutput,
     classes: Tensor,
     targets: Mapping[str, Tensor],
     layout: Layout,

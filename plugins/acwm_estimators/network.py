@@ -77,7 +77,7 @@ class Features(nn.Module):
 
 
 @dataclass(frozen=True)
-class Output:
+class NetworkOutput:
     """The output of the network for N frames.
 
     Attributes:
@@ -167,7 +167,7 @@ class StateNetwork(nn.Module):
         if self.layout.totals:
             self.get_buffer("total_scale").copy_(torch.as_tensor(targets["totals"].mean(0)))
 
-    def forward(self, frames: Tensor) -> Output:
+    def forward(self, frames: Tensor) -> NetworkOutput:
         """Read frames `[N, 3, H, W]` in [0, 1] of any size."""
         height, width = frames.shape[-2:]
         aspect = width / height
@@ -187,7 +187,7 @@ class StateNetwork(nn.Module):
         codes = self._numbers(maps[len(self.layout.points) :], heat, bodies)
         amounts = functional.softplus(totals).mean((2, 3)) * self.get_buffer("total_scale") * 8
         heights = self._heights(surface, self.layout.surface, aspect)
-        return Output(quarters, heat, points, codes, amounts, heights)
+        return NetworkOutput(quarters, heat, points, codes, amounts, heights)
 
     def _points(
         self, maps: list[Tensor], aspect: float

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.rotations import angle_of_code, rotation_of_code
 from acwm_estimators.curve import same_end_first
-from acwm_estimators.layout import Curve, Layout, Local, Points
+from acwm_estimators.layout import CurveField, Layout, Local, Points
 from acwm_estimators.targets import MIN_SEEN, points_there
 from acwm_estimators.turns import upright
 
@@ -85,7 +85,7 @@ def _hide(values: Array, hidden: NDArray[np.bool_]) -> None:
     values[hidden[:, 0] if hidden.ndim == 2 and values.ndim == 2 else hidden] = np.nan
 
 
-def _curve(nodes: Array, curve: Curve) -> dict[str, Array]:
+def _curve(nodes: Array, curve: CurveField) -> dict[str, Array]:
     """The nodes and the length of a body."""
     length = np.linalg.norm(np.diff(nodes, axis=1), axis=-1).sum(-1, keepdims=True)
     return {curve.field: same_end_first(nodes), curve.length: length}

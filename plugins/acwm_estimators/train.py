@@ -24,7 +24,7 @@ from torch import nn
 from acwm_core.data.card import DatasetCard
 from acwm_core.errors import RecipeError, suggest
 from acwm_core.plugins import catalog
-from acwm_estimators.frames import Frames, draw, load_frames, reconstructed
+from acwm_estimators.frames import LabelledFrames, draw, load_frames, reconstructed
 from acwm_estimators.layout import Layout, layout_of
 from acwm_estimators.losses import losses
 from acwm_estimators.network import StateNetwork
@@ -37,10 +37,10 @@ CODEC = "compact"  # its reconstructions are used for training, too
 RECONSTRUCTED = {True: (8, 13), False: (2, 5)}  # clips and frames per clip, if frames are small
 
 
-def all_frames(folders: Sequence[Path], layout: Layout, most: int) -> list[Frames]:
+def all_frames(folders: Sequence[Path], layout: Layout, most: int) -> list[LabelledFrames]:
     """The frames of every dataset, and codec reconstructions of some of them."""
     codec = catalog().create("codec", CODEC).eval()
-    found: list[Frames] = []
+    found: list[LabelledFrames] = []
     for folder in folders:
         frames = load_frames(folder, layout, most)
         clips, length = RECONSTRUCTED[frames.video.shape[1] <= SMALL]
@@ -50,7 +50,7 @@ def all_frames(folders: Sequence[Path], layout: Layout, most: int) -> list[Frame
     return found
 
 
-def chances(sources: Sequence[Frames]) -> np.ndarray:
+def chances(sources: Sequence[LabelledFrames]) -> np.ndarray:
     """Probability of each source: the same for small and large frames, less for reconstructions."""
     weights = np.array([1.0 if index % 2 == 0 else 0.25 for index in range(len(sources))])
     small = np.array([source.video.shape[1] <= SMALL for source in sources])
@@ -61,7 +61,7 @@ def chances(sources: Sequence[Frames]) -> np.ndarray:
 
 def train(
     network: StateNetwork,
-    sources: Sequence[Frames],
+    sources: Sequence[LabelledFrames],
     steps: int,
     batch: int,
     peak: float,

@@ -16,7 +16,7 @@ from acwm_core.cli.__main__ import ENDS_WITH_INPUT
 from acwm_core.executors import available_cores
 from acwm_core.interrupts import exit_by_signal
 from acwm_experiment.logs import StepLogs
-from acwm_experiment.steps import Step
+from acwm_experiment.steps import ExperimentStep
 
 PATIENCE = 120.0
 """Seconds that stopped processes have to finish their training step and save."""
@@ -25,7 +25,7 @@ POLL = 0.05  # seconds between checks of the processes
 
 
 class _Running(NamedTuple):
-    step: Step
+    step: ExperimentStep
     process: subprocess.Popen[bytes]
     started: float
     gpu: str
@@ -49,7 +49,7 @@ class LocalRunner:
         logs: StepLogs,
         jobs: int,
         say: Callable[[str], None],
-        is_done: Callable[[Step], bool],
+        is_done: Callable[[ExperimentStep], bool],
     ) -> None:
         self._command, self._logs, self._jobs = tuple(command), logs, jobs
         self._say, self._is_done = say, is_done
@@ -57,7 +57,7 @@ class LocalRunner:
         self._free = [gpus[place % len(gpus)] for place in range(jobs)]
         self._running: list[_Running] = []
 
-    def run(self, steps: Sequence[Step]) -> dict[str, str]:
+    def run(self, steps: Sequence[ExperimentStep]) -> dict[str, str]:
         """Run `steps`, each after the ones that it needs. A failed step does not stop the others.
 
         Steps that need a failed one are left out, but the report is written from the rest. Ctrl-C
@@ -88,7 +88,7 @@ class LocalRunner:
             signal.signal(signal.SIGTERM, before)
         return failures
 
-    def _start_what_can(self, waiting: dict[str, Step], failures: dict[str, str]) -> None:
+    def _start_what_can(self, waiting: dict[str, ExperimentStep], failures: dict[str, str]) -> None:
         unsettled = {*waiting, *(each.step.name for each in self._running)}
         for step in [each for each in waiting.values() if not unsettled & {*each.needs}]:
             failed = [name for name in step.needs if name in failures]
@@ -100,7 +100,7 @@ class LocalRunner:
                     self._running.append(self._start(step, self._free.pop(0)))
                 del waiting[step.name]
 
-    def _start(self, step: Step, gpu: str) -> _Running:
+    def _start(self, step: ExperimentStep, gpu: str) -> _Running:
         environment = {**os.environ, ENDS_WITH_INPUT: "1"}
         if self._jobs > 1:  # steps side by side share the machine
             threads = max(1, available_cores() // self._jobs)

@@ -12,7 +12,7 @@ from acwm_core.files import held
 from acwm_executors.batch import BatchExecutor, JobState
 from acwm_experiment.local import LocalRunner
 from acwm_experiment.plan import ExperimentPlan
-from acwm_experiment.steps import Step, all_progress, all_steps, step_progress
+from acwm_experiment.steps import ExperimentStep, all_progress, all_steps, step_progress
 from acwm_experiment.table import EXPERIMENT_FILE, Experiment
 
 Say = Callable[[str], None]
@@ -104,7 +104,9 @@ def _jobs(plan: ExperimentPlan) -> dict[str, JobState]:
 
 
 @contextlib.contextmanager
-def _locked_folder(plan: ExperimentPlan, steps: Sequence[Step]) -> Generator[list[Step]]:
+def _locked_folder(
+    plan: ExperimentPlan, steps: Sequence[ExperimentStep]
+) -> Generator[list[ExperimentStep]]:
     """Create and lock the experiment's folder with `experiment.json`, and yield the steps left.
 
     Raises:
@@ -145,7 +147,7 @@ def overview(plan: ExperimentPlan) -> Iterator[str]:
 
 
 def _state(
-    plan: ExperimentPlan, step: Step, progress: float, job: JobState | None, *, busy: bool
+    plan: ExperimentPlan, step: ExperimentStep, progress: float, job: JobState | None, *, busy: bool
 ) -> tuple[str, str]:
     if progress == 1:
         return "done", ""

@@ -29,7 +29,7 @@ _recipe = functools.cache(Recipe.from_yaml)  # the recipe of a run never changes
 
 
 @dataclass(frozen=True)
-class Step(Job):
+class ExperimentStep(Job):
     """One command, run here or as a job of a batch system."""
 
     title: str = ""  # readable description of what it does
@@ -45,9 +45,9 @@ class Step(Job):
         return (self.run.max_steps, "steps") if self.run else (0, "")
 
 
-def all_steps(plan: ExperimentPlan, workers: int | None = None) -> list[Step]:
+def all_steps(plan: ExperimentPlan, workers: int | None = None) -> list[ExperimentStep]:
     """All steps, each after those it needs; simulations use `workers` processes or all cores."""
-    steps: dict[str, Step] = {}
+    steps: dict[str, ExperimentStep] = {}
     for run in plan.runs:
         needs: tuple[str, ...] = ()
         if run.dataset:
@@ -60,8 +60,10 @@ def all_steps(plan: ExperimentPlan, workers: int | None = None) -> list[Step]:
         nodes, gpus = run.recipe.trainer.get("num_nodes", 1), run.gpus
         first, then = f"train {run.title}", f"evaluate {run.title}"
         before = (*needs, train)
-        steps[train] = Step(train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run)
-        steps[evaluate] = Step(
+        steps[train] = ExperimentStep(
+            train, "train", fit, needs, nodes, max(1, gpus), gpus, first, run=run
+        )
+        steps[evaluate] = ExperimentStep(
             evaluate, "evaluate", score, before, 1, 1, min(1, gpus), then, run=run
         )
     for task in plan.tasks:
@@ -70,13 +72,13 @@ def all_steps(plan: ExperimentPlan, workers: int | None = None) -> list[Step]:
         return [*steps.values()]
     results = tuple(step.name for step in steps.values() if step.kind in ("evaluate", "plan"))
     command = ("report", str(plan.folder), "--out", str(plan.report))
-    report = Step("report", "report", command, results, title="write the report")
+    report = ExperimentStep("report", "report", command, results, title="write the report")
     return [*steps.values(), report]
 
 
-def _planning(task: PlanCommand) -> Step:
+def _planning(task: PlanCommand) -> ExperimentStep:
     needs, gpus = ((f"train-{task.run.folder.name}",), task.run.gpus) if task.run else ((), 0)
-    return Step(
+    return ExperimentStep(
         f"plan-{task.name}",
         "plan",
         ("plan", *task.arguments),
@@ -87,7 +89,7 @@ def _planning(task: PlanCommand) -> Step:
     )
 
 
-def _simulation(dataset: DatasetSpec, workers: int | None) -> Step:
+def _simulation(dataset: DatasetSpec, workers: int | None) -> ExperimentStep:
     choice = dataset.choice
     options = {
         "--episodes": ",".join(map(str, choice.episodes or ())),
@@ -98,7 +100,7 @@ def _simulation(dataset: DatasetSpec, workers: int | None) -> Step:
         "--workers": "" if workers is None else str(workers),
     }
     given = [word for option, value in options.items() if value for word in (option, value)]
-    return Step(
+    return ExperimentStep(
         f"simulate-{slug(str(dataset.path))}",
         "simulate",
         ("generate", dataset.environment, "--out", str(dataset.path), *given),
@@ -107,7 +109,7 @@ def _simulation(dataset: DatasetSpec, workers: int | None) -> Step:
     )
 
 
-def step_progress(step: Step, plan: ExperimentPlan) -> float:
+def step_progress(step: ExperimentStep, plan: ExperimentPlan) -> float:
     """The share of a step's work that is done, in [0, 1].
 
     See `training_progress` and `PlanningJob.progress`.
@@ -127,7 +129,7 @@ def step_progress(step: Step, plan: ExperimentPlan) -> float:
     return float(plan.report.exists() and plan.report.stat().st_mtime_ns >= newest)
 
 
-def all_progress(steps: Sequence[Step], plan: ExperimentPlan) -> dict[str, float]:
+def all_progress(steps: Sequence[ExperimentStep], plan: ExperimentPlan) -> dict[str, float]:
     """`step_progress` of every step, by name; datasets no longer needed count as done."""
     progress = {step.name: step_progress(step, plan) for step in steps}
     needed = {name for step in steps if progress[step.name] < 1 for name in step.needs}

@@ -79,7 +79,7 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ArmLayout:
     """The initial layout of an episode.
 
     Attributes:
@@ -99,7 +99,7 @@ class Layout:
 
 def draw_layout(
     workspace: Workspace, count: int, height: float, rng: np.random.Generator
-) -> Layout:
+) -> ArmLayout:
     """Draw posts in the arm's way, a first pose in the training workspace, and goals.
 
     Args:
@@ -119,7 +119,7 @@ def draw_layout(
                 goals.append(point)
         posts = _draw_posts(clearance, np.array(poses), count, height, rng)
         if len(posts) == count:
-            return Layout(posts, start, np.array(poses[1:]), np.array(goals[1:]), clearance)
+            return ArmLayout(posts, start, np.array(poses[1:]), np.array(goals[1:]), clearance)
         clearance.close()
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from acwm_kinematics.arm_layout import Layout, Workspace
+from acwm_kinematics.arm_layout import ArmLayout, Workspace
 from acwm_kinematics.arm_planner import Joints, plan
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation
 from acwm_kinematics.arm_timing import rounded, timed
@@ -32,7 +32,7 @@ class Reacher:
     def __init__(
         self,
         world: ArmSimulation,
-        layout: Layout,
+        layout: ArmLayout,
         workspace: Workspace,
         frame: float,
         rng: np.random.Generator,

@@ -17,7 +17,7 @@ from acwm_kinematics.arm_drawing import (
     TABLE_ID,
     ArmDrawing,
 )
-from acwm_kinematics.arm_layout import Layout, Workspace, draw_layout
+from acwm_kinematics.arm_layout import ArmLayout, Workspace, draw_layout
 from acwm_kinematics.arm_planner import Joints
 from acwm_kinematics.arm_policy import Reacher
 from acwm_kinematics.arm_simulation import MAX_STEP, ArmSimulation, Servos
@@ -125,7 +125,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         light=ARM_LIGHT,
     )
 
-    _layout: Layout | None = None
+    _layout: ArmLayout | None = None
 
     def close(self) -> None:
         super().close()
@@ -149,7 +149,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         self._layout = replace(layout, start=layout.start + amount * turn)
         self.simulation = self._simulate(self._layout, servos)
 
-    def _simulate(self, layout: Layout, servos: Servos) -> ArmSimulation:
+    def _simulate(self, layout: ArmLayout, servos: Servos) -> ArmSimulation:
         self._touched = set[tuple[int, int]]()
         posts = len(layout.posts)
         goal_ids = range(FIRST_POST_ID + MAX_POSTS, FIRST_POST_ID + MAX_POSTS + GOALS)
@@ -157,7 +157,7 @@ class RobotArm(SceneEnvironment[ArmSimulation]):
         return ArmSimulation(layout.start, layout.posts, layout.goals, servos, (*ids, *goal_ids))
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ArmLayout:
         """The initial layout of the current episode."""
         assert self._layout is not None, "reset() comes first"
         return self._layout

@@ -36,7 +36,7 @@ CHUNK = 32
 
 
 @dataclass(frozen=True)
-class Layer:
+class FeatureLayer:
     """A convolution followed by ReLU.
 
     Attributes:
@@ -56,26 +56,26 @@ class Layer:
 
 NETWORKS = {
     "alex": (
-        Layer(0, stride=4, padding=2, compared=True),
-        Layer(3, padding=2, pool=3, compared=True),
-        Layer(6, pool=3, compared=True),
-        Layer(8, compared=True),
-        Layer(10, compared=True),
+        FeatureLayer(0, stride=4, padding=2, compared=True),
+        FeatureLayer(3, padding=2, pool=3, compared=True),
+        FeatureLayer(6, pool=3, compared=True),
+        FeatureLayer(8, compared=True),
+        FeatureLayer(10, compared=True),
     ),
     "vgg": (
-        Layer(0),
-        Layer(2, compared=True),
-        Layer(5, pool=2),
-        Layer(7, compared=True),
-        Layer(10, pool=2),
-        Layer(12),
-        Layer(14, compared=True),
-        Layer(17, pool=2),
-        Layer(19),
-        Layer(21, compared=True),
-        Layer(24, pool=2),
-        Layer(26),
-        Layer(28, compared=True),
+        FeatureLayer(0),
+        FeatureLayer(2, compared=True),
+        FeatureLayer(5, pool=2),
+        FeatureLayer(7, compared=True),
+        FeatureLayer(10, pool=2),
+        FeatureLayer(12),
+        FeatureLayer(14, compared=True),
+        FeatureLayer(17, pool=2),
+        FeatureLayer(19),
+        FeatureLayer(21, compared=True),
+        FeatureLayer(24, pool=2),
+        FeatureLayer(26),
+        FeatureLayer(28, compared=True),
     ),
 }
 """AlexNet and VGG-16, with the layer indices of torchvision."""
@@ -179,7 +179,7 @@ def bundled_heads(network: str) -> Path:
     return Path(str(files("torchmetrics.functional.image"))) / "lpips_models" / f"{network}.pth"
 
 
-def _convolutions(path: Path, layers: tuple[Layer, ...]) -> list[tuple[Tensor, Tensor]]:
+def _convolutions(path: Path, layers: tuple[FeatureLayer, ...]) -> list[tuple[Tensor, Tensor]]:
     """Weight and bias of each layer; checks that their channels fit together."""
     tensors, found, channels = read_tensors(path), list[tuple[Tensor, Tensor]](), 3
     for layer in layers:

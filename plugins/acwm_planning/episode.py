@@ -71,7 +71,7 @@ def spec_of_seed(card: EnvironmentCard, seed: int) -> EpisodeSpec:
 
 
 @dataclass(frozen=True)
-class Start:
+class EpisodeStart:
     """The start of an episode.
 
     Attributes:
@@ -92,7 +92,7 @@ class Start:
 
 def start_of(
     environment: TaskEnvironment, spec: EpisodeSpec, *, given: int = 1, goal: Goal | None = None
-) -> Start:
+) -> EpisodeStart:
     """Start an episode, with its own goal or with a given one.
 
     Args:
@@ -108,7 +108,7 @@ def start_of(
         history.actions.append(environment.environment.still_action())
         frame, _, _, _, info = environment.step(history.actions[-1])
         history.frames.append(frame)
-    return Start(history, environment.goal, float(info["distance"]))
+    return EpisodeStart(history, environment.goal, float(info["distance"]))
 
 
 @dataclass(frozen=True)

@@ -334,8 +334,8 @@ class ModelRollouts:
 
         def expected() -> Keypoints:
             with torch.set_grad_enabled(actions.requires_grad):
-                found = self._predict_keypoints(given, actions, seed)
-            return found._replace(values=found.values[:, past:])
+                keypoints = self._predict_keypoints(given, actions, seed)
+            return keypoints._replace(values=keypoints.values[:, past:])
 
         latents = given.latents.expand(len(actions), -1, -1, -1, -1)
         world = self.world_model

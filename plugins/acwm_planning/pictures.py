@@ -168,12 +168,12 @@ def begin_of(
     check_environment(episodes, bundle.card)
     if not 0 <= episode < len(episodes):
         raise DataError(f"{data} has no test episode {episode}: give 0 to {len(episodes) - 1}")
-    found, given = episodes[episode], bundle.world_model.context_frames
-    if len(found.video) <= given:
-        raise DataError(f"episode {episode} is too short: it has {len(found.video)} frames")
-    last = min(given - 1 + ahead, len(found.video) - 1) if goal else given - 1
-    video = cast(NDArray[np.uint8], found.video)
-    return [*video[:given]], [*found.actions[: given - 1]], video[last]
+    recorded, given = episodes[episode], bundle.world_model.context_frames
+    if len(recorded.video) <= given:
+        raise DataError(f"episode {episode} is too short: it has {len(recorded.video)} frames")
+    last = min(given - 1 + ahead, len(recorded.video) - 1) if goal else given - 1
+    video = cast(NDArray[np.uint8], recorded.video)
+    return [*video[:given]], [*recorded.actions[: given - 1]], video[last]
 
 
 def write_plan(out: Path, plan: PicturePlan, card: EnvironmentCard) -> None:

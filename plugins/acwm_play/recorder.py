@@ -36,7 +36,7 @@ _writing = threading.Lock()
 
 
 @dataclass
-class Recording:
+class PlayedEpisode:
     """A recording in progress.
 
     Attributes:
@@ -73,7 +73,7 @@ class Recording:
         )
 
 
-def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, int, Path]:
+def save(recording: PlayedEpisode, card: EnvironmentCard, out: Path) -> tuple[Path, int, Path]:
     """Add a recording of at least two frames to the dataset of its world below `out`.
 
     Returns:
@@ -97,7 +97,7 @@ def save(recording: Recording, card: EnvironmentCard, out: Path) -> tuple[Path, 
     return folder, index, video
 
 
-def _append(recording: Recording, card: EnvironmentCard, folder: Path) -> int:
+def _append(recording: PlayedEpisode, card: EnvironmentCard, folder: Path) -> int:
     """Write one shard per episode, so that existing shards do not change."""
     requires = catalog().component("environment", card.name).requires
     new = DatasetCard(

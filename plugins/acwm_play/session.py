@@ -25,7 +25,7 @@ from acwm_play.figures import pixel_error
 from acwm_play.live_world import LiveWorld
 from acwm_play.messages import Outbox, PageMessage, pack
 from acwm_play.pool import WorldPool
-from acwm_play.recorder import MAX_FRAMES, Recording, save
+from acwm_play.recorder import MAX_FRAMES, PlayedEpisode, save
 from acwm_play.simulator import SceneSpec, TimeStep
 
 REST = 2.0
@@ -51,7 +51,7 @@ class Session:
         self._take_over = self._redraw = False
         self._last: tuple[TimeStep, NDArray[np.uint8]] | None = None
         self._alone = 0
-        self._recording: Recording | None = None
+        self._recording: PlayedEpisode | None = None
         self._keep_recording = False
         self._predicting: asyncio.Task[None] | None = None
         self._measuring: asyncio.Task[None] | None = None
@@ -298,7 +298,7 @@ class Session:
             self._tell("notice", text=text, wrong=True)
             self._tell_state()
         elif self._keep_recording and self._recording is None and self._last is not None:
-            self._recording = Recording([self._last[0]], [self._last[1]])
+            self._recording = PlayedEpisode([self._last[0]], [self._last[1]])
         elif not self._keep_recording:
             await self._save()
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from acwm_benchmark.lossy import LossyVideo, Sample
+from acwm_benchmark.lossy import LossyClip, LossyVideo
 from acwm_benchmark.videos import Wanted, coding_of
 from acwm_benchmark.videos import read_video as read
 from tests.benchmark.participant import WRITERS, to_gif, to_video
@@ -77,7 +77,7 @@ def test_the_loss_that_is_measured_is_that_of_the_file(name, tmp_path, video):
 
     CODECS[name](tmp_path / "clip", video)
     (path,) = tmp_path.iterdir()
-    handed_in = Sample(path.stat().st_size, read_video(path, 10))
+    handed_in = LossyClip(path.stat().st_size, read_video(path, 10))
     true = np.abs(handed_in.video - video).mean()
     codec = LossyVideo(coding_of(path), [handed_in], 10)
     again = codec(torch.as_tensor(video).permute(0, 3, 1, 2)[None])[0]

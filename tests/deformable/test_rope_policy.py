@@ -6,7 +6,7 @@ import pytest
 from acwm_deformable.physics import POLE_RADIUS
 from acwm_deformable.rope import NODES, POLE_ROOM, Cord
 from acwm_deformable.rope_curves import lay_rope
-from acwm_deformable.rope_paths import Chart
+from acwm_deformable.rope_paths import ClearanceGrid
 from acwm_deformable.rope_policy import Pusher
 
 REACH = 0.13
@@ -28,7 +28,7 @@ def walked(start, corners, step=0.01):
 
 def test_a_free_way_is_straight():
     start, goal = np.array([-0.5, 0.5]), np.array([0.7, 0.8])
-    chart = Chart(across(), start, REACH)
+    chart = ClearanceGrid(across(), start, REACH)
     assert len(chart.way(goal)) == 1
     straight = np.linalg.norm(goal - start)
     assert straight - 0.1 < chart.cost(goal) < 1.15 * straight
@@ -36,7 +36,7 @@ def test_a_free_way_is_straight():
 
 def test_the_way_leads_around_the_end_of_the_rope():
     start, goal = np.array([0.2, -0.4]), np.array([0.3, 0.4])
-    chart = Chart(across(), start, REACH)
+    chart = ClearanceGrid(across(), start, REACH)
     way = chart.way(goal)
     line = walked(start, way)
     np.testing.assert_allclose(way[-1], goal)
@@ -49,7 +49,7 @@ def test_the_way_leads_around_the_end_of_the_rope():
 
 def test_places_out_of_reach_cost_infinitely_much():
     wall = across(POLE_ROOM[0] + 0.1)
-    chart = Chart(wall, np.array([0.0, -0.5]), REACH)
+    chart = ClearanceGrid(wall, np.array([0.0, -0.5]), REACH)
     assert chart.cost(np.array([0.0, 0.5])) == np.inf  # behind a rope from edge to edge
     assert chart.cost(np.array([0.0, 0.05])) == np.inf  # in the rope
     assert chart.cost(np.array([2.0, 0.0])) == np.inf  # off the table
@@ -58,7 +58,7 @@ def test_places_out_of_reach_cost_infinitely_much():
 
 def test_a_pole_that_touches_the_rope_can_leave_it():
     start = np.array([0.0, -0.105])
-    chart = Chart(across(), start, REACH)
+    chart = ClearanceGrid(across(), start, REACH)
     assert chart.cost(np.array([0.0, -0.6])) < 0.7
 
 
@@ -70,7 +70,7 @@ def test_random_ways_never_touch_the_rope():
         start, goal = rng.uniform(-0.9, 0.9, (2, 2))
         if min(np.linalg.norm(nodes - place, axis=1).min() for place in (start, goal)) < REACH:
             continue
-        chart = Chart(nodes, start, REACH)
+        chart = ClearanceGrid(nodes, start, REACH)
         if np.isfinite(chart.cost(goal)):
             found += 1
             line = walked(start, chart.way(goal))

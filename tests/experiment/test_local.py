@@ -13,11 +13,11 @@ import pytest
 from acwm_experiment import local
 from acwm_experiment.local import LocalRunner, visible_gpus
 from acwm_experiment.logs import StepLogs
-from acwm_experiment.steps import Step
+from acwm_experiment.steps import ExperimentStep
 
 
 def step(name, script="", needs=(), kind="train"):
-    return Step(name, kind, (script,), tuple(needs), title=name)
+    return ExperimentStep(name, kind, (script,), tuple(needs), title=name)
 
 
 @pytest.fixture

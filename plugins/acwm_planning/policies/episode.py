@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Task, judged
-from acwm_planning.episode import EpisodeResult, Start
+from acwm_planning.episode import EpisodeResult, EpisodeStart
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Outcome:
 
 
 def compute_outcome(
-    distances: NDArray[np.float64], success: NDArray[np.bool_], start: Start
+    distances: NDArray[np.float64], success: NDArray[np.bool_], start: EpisodeStart
 ) -> Outcome:
     """Compute the outcome of the T frames after the start.
 
@@ -56,7 +56,7 @@ def compute_outcome(
     return Outcome(bool(success.any()), -float(counted.sum()), steps, float(counted[-1]), unread)
 
 
-def read_outcome(observation: Observation, task: Task, start: Start) -> Outcome:
+def read_outcome(observation: Observation, task: Task, start: EpisodeStart) -> Outcome:
     """Compute the outcome of T frames that an estimator has read."""
     distances, success = (
         judged(task, method, observation, start.goal) for method in ("distance", "success")
@@ -64,7 +64,7 @@ def read_outcome(observation: Observation, task: Task, start: Start) -> Outcome:
     return compute_outcome(distances.astype(np.float64), success, start)
 
 
-def true_outcome(result: EpisodeResult, start: Start) -> Outcome:
+def true_outcome(result: EpisodeResult, start: EpisodeStart) -> Outcome:
     """Compute the outcome of an episode that was played in the true simulator."""
     distances = np.array(result.distances[1:], np.float64)
     return compute_outcome(distances, np.array(result.successes), start)

@@ -18,7 +18,7 @@ from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.shapes import Video
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.controllers import Controller
-from acwm_planning.episode import EpisodeResult, Start, play, start_of
+from acwm_planning.episode import EpisodeResult, EpisodeStart, play, start_of
 from acwm_planning.policies.episode import (
     Outcome,
     join_observations,
@@ -48,19 +48,19 @@ class EpisodeSimulator:
         self._estimator = estimator
         self._parts = environment.environment, environment.task
 
-    def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> Start:
+    def start(self, spec: EpisodeSpec, goal: Goal | None = None) -> EpisodeStart:
         """Start an episode, with its own goal or with a given one."""
         with noting(f"in episode {spec.index} of {spec.split}", *self._parts):
             return start_of(self.environment, spec, given=self._given, goal=goal)
 
-    def play(self, start: Start, controller: Controller, steps: int) -> EpisodeResult:
+    def play(self, start: EpisodeStart, controller: Controller, steps: int) -> EpisodeResult:
         """Play an episode from this start, with so many actions."""
         spec = start.history.spec
         return play(
             self.environment, spec, controller, steps=steps, given=self._given, goal=start.goal
         )
 
-    def play_own(self, start: Start, policy: OwnPolicy, steps: int) -> EpisodeResult:
+    def play_own(self, start: EpisodeStart, policy: OwnPolicy, steps: int) -> EpisodeResult:
         """Play an episode with a user's policy, which observes true frames."""
         return self.play(start, OwnController(policy, self._estimator, self._stride), steps)
 
@@ -88,7 +88,7 @@ class ModelJudge:
         self._world, self._estimator, self._task = world_model, estimator, task
         self._steps, self.batch = steps, batch
 
-    def replay(self, start: Start, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
+    def replay(self, start: EpisodeStart, actions: Sequence[NDArray[np.float32]]) -> list[Outcome]:
         """Outcomes of sequences of raw actions, `[T, A]` each.
 
         All sequences get the same noise, so they differ only in actions.
@@ -99,7 +99,7 @@ class ModelJudge:
             outcomes += self._replay_batch(start, torch.from_numpy(batch))
         return outcomes
 
-    def _replay_batch(self, start: Start, actions: Tensor) -> list[Outcome]:
+    def _replay_batch(self, start: EpisodeStart, actions: Tensor) -> list[Outcome]:
         number, context = len(actions), len(start.history.frames)
         last = torch.zeros_like(actions[:, :1])  # no frame follows it
         frames, between = self._given(start)
@@ -119,7 +119,7 @@ class ModelJudge:
             for parts in zip(*observations, strict=True)
         ]
 
-    def perform(self, start: Start, policy: OwnPolicy, steps: int) -> Outcome:
+    def perform(self, start: EpisodeStart, policy: OwnPolicy, steps: int) -> Outcome:
         """Outcome of a policy after `steps` actions; it decides once per latent frame."""
         given, between = self._given(start)
         seeds = [start.history.spec.index]
@@ -141,7 +141,7 @@ class ModelJudge:
     def _device(self) -> torch.device:
         return self._world.action_low.device
 
-    def _given(self, start: Start) -> tuple[Video, Tensor]:
+    def _given(self, start: EpisodeStart) -> tuple[Video, Tensor]:
         """Context frames on the model's device, and the raw actions between them on the CPU."""
         actions = np.array(start.history.actions, np.float32).reshape(
             -1, len(self._world.action_low)
@@ -149,6 +149,6 @@ class ModelJudge:
         return as_clip(start.frames)[None].to(self._device), torch.from_numpy(actions)[None]
 
 
-def _when(start: Start) -> str:
+def _when(start: EpisodeStart) -> str:
     spec = start.history.spec
     return f"in episode {spec.index} of {spec.split}, while the model predicts"

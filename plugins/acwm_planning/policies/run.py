@@ -26,7 +26,7 @@ from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_interventions.counterfactual import plan_branches
 from acwm_planning.controllers import PolicyController
-from acwm_planning.episode import EpisodeResult, Start, load_task, spec_of_seed
+from acwm_planning.episode import EpisodeResult, EpisodeStart, load_task, spec_of_seed
 from acwm_planning.policies.episode import Outcome, read_outcome, true_outcome
 from acwm_planning.policies.judges import EpisodeSimulator, ModelJudge
 from acwm_planning.policies.own import OwnPolicy
@@ -118,23 +118,31 @@ class Ranker(EpisodeTable):
             lines.append(self._decision(start, seed, branches, outcomes[len(episodes) :]))
         return lines
 
-    def _play(self, start: Start, policy: ScriptedPolicy) -> EpisodeResult:
+    def _play(self, start: EpisodeStart, policy: ScriptedPolicy) -> EpisodeResult:
         return self._simulator.play(start, PolicyController(policy.begin), self._steps)
 
-    def _judge(self, start: Start, episode: EpisodeResult, model: Outcome) -> dict[str, Outcome]:
+    def _judge(
+        self, start: EpisodeStart, episode: EpisodeResult, model: Outcome
+    ) -> dict[str, Outcome]:
         """The outcome of an episode by judge: the truth, the estimator, and the model."""
         observation = self._estimator.read(as_clip(episode.frames))
         read = read_outcome(observation, self._environment.task, start)
         return {"truth": true_outcome(episode, start), "estimator": read, "model": model}
 
     def _line(
-        self, name: str, seed: int, loop: str, start: Start, episode: EpisodeResult, model: Outcome
+        self,
+        name: str,
+        seed: int,
+        loop: str,
+        start: EpisodeStart,
+        episode: EpisodeResult,
+        model: Outcome,
     ) -> Line:
         judges = self._judge(start, episode, model)
         facts = {judge: outcome.facts() for judge, outcome in judges.items()}
         return {"policy": name, "seed": seed, "loop": loop, **facts}
 
-    def _branches(self, start: Start, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
+    def _branches(self, start: EpisodeStart, seed: int) -> list[tuple[str, NDArray[np.float32]]]:
         """The script's own actions and their alternatives, `[T, A]` each."""
         card = self._environment.environment.card
         other = first_start(self._simulator, card, range(seed + 1, seed + 1 + TRIED_SEEDS))
@@ -148,7 +156,7 @@ class Ranker(EpisodeTable):
 
     def _decision(
         self,
-        start: Start,
+        start: EpisodeStart,
         seed: int,
         branches: Sequence[tuple[str, NDArray[np.float32]]],
         outcomes: Sequence[Outcome],
@@ -219,7 +227,9 @@ def rank_policies(
         inner.close()
 
 
-def first_start(simulator: EpisodeSimulator, card: EnvironmentCard, seeds: Sequence[int]) -> Start:
+def first_start(
+    simulator: EpisodeSimulator, card: EnvironmentCard, seeds: Sequence[int]
+) -> EpisodeStart:
     """The start of the first seed that is not solved there."""
     for seed in seeds[:-1]:
         with contextlib.suppress(SolvedAtStartError):

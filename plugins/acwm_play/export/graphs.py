@@ -72,7 +72,7 @@ class _Part(nn.Module):
         return self.world.conditioner.condition(rows, 2, self.world.model.width)
 
 
-class Start(_Part):
+class StartGraph(_Part):
     """Maps the given frames `[1, K, 3, H, W]` to the latent of the last one and the state.
 
     For a model that draws, its noise `[1, N]` is a second input.
@@ -86,7 +86,7 @@ class Start(_Part):
         return latents[:, -1:], *self.model.initial_state(latents, nothing, *draw)
 
 
-class Step(_Part):
+class StepGraph(_Part):
     """Maps raw actions `[1, stride, A]` and a state to the next latent and state."""
 
     def forward(self, actions: Actions, *state: Tensor) -> tuple[Tensor, ...]:
@@ -126,14 +126,14 @@ def export_graphs(world: WorldModel, size: tuple[int, int]) -> dict[str, bytes]:
     actions = world.action_low.expand(1, world.codec.temporal_stride, -1)
     begin = given, *_draw(world, seed=0)
     with torch.no_grad():
-        latent, *state = Start(world)(*begin)
+        latent, *state = StartGraph(world)(*begin)
         state = [tensor.clone() for tensor in state]  # one given twice would be one input
         states = [f"state_{k}" for k in range(len(state))]
         outputs = ["latent", *(f"next_{name}" for name in states)]
         graph, decoded = _graph, (latent, *_reference(world, given))
         return {
-            "start": graph(Start(world), begin, ["given", "noise"], ["latent", *states]),
-            "step": graph(Step(world), (actions, *state), ["actions", *states], outputs),
+            "start": graph(StartGraph(world), begin, ["given", "noise"], ["latent", *states]),
+            "step": graph(StepGraph(world), (actions, *state), ["actions", *states], outputs),
             "decode": graph(Decode(world), decoded, ["latent", "reference"], ["first", "frames"]),
         }
 
