@@ -58,11 +58,15 @@ KINDS = {
         "which clips an evaluation predicts, and published scores on them",
     ),
     "trained_model": ("pathlib:Path", "a run folder; of NAME://ADDRESS, made from an address"),
+    "advisor": (
+        "acwm_core.recipe.advice:Advisor",
+        "chooses an overlay for data; recipes name it",
+    ),
     "command": ("click:Command", "a command of acwm; its module imports nothing heavy"),
 }
 """Core's kinds of component: what a target is, and in a phrase. Plugins add kinds of their own."""
 
-UNCHECKED = ("executor", "protocol", "trained_model", "command")
+UNCHECKED = ("executor", "protocol", "trained_model", "advisor", "command")
 """Those without a conformance suite; all others have one, ``acwm_core.checks.check_KIND``."""
 
 OWN = {

@@ -50,7 +50,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     words = [word for word in words if word not in resumed]
     resume = resumed[-1].removeprefix("resume=") if resumed else None
     if resume in (None, "auto"):
-        composed, run = _recipe_to_start(words, out)
+        composed, run = _recipe_to_start(words, out, continues=resume is not None)
     else:
         resume = run = RUN.convert(resume, None, None)
         composed = _recipe_to_resume(run, words, out)
@@ -68,7 +68,9 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     click.echo(f"trained {run}; next: acwm evaluate {run}")
 
 
-def _recipe_to_start(words: Sequence[str], out: Path | None) -> tuple[Recipe, Path]:
+def _recipe_to_start(
+    words: Sequence[str], out: Path | None, *, continues: bool
+) -> tuple[Recipe, Path]:
     """The recipe of a command's words, and the run folder."""
     from acwm_core.recipe import compose
 
@@ -76,7 +78,35 @@ def _recipe_to_start(words: Sequence[str], out: Path | None) -> tuple[Recipe, Pa
         raise RecipeError("resume=auto needs the recipe, too; resume=RUN takes it from the run")
     name, *overrides = words
     overlays = "".join(override for override in overrides if override.startswith("+"))
-    return compose(name, overrides), out or Path("runs", Path(name).stem + overlays)
+    run, plain = out or Path("runs", Path(name).stem + overlays), compose(name, overrides)
+    if continues and not _others(run, plain):
+        return plain, run  # begun before its data was looked at, or with another overlay
+    return _advised(plain, name, overrides), run
+
+
+def _advised(plain: Recipe, name: str, overrides: Sequence[str]) -> Recipe:
+    """The recipe with the overlay that suits its data; says which, and why."""
+    from acwm_core.recipe import compose
+    from acwm_core.recipe.advice import advised
+
+    suited, advice = advised(name, overrides)
+    if advice is None:
+        return plain
+    taken = f"{name} +{advice.overlay}" if advice.overlay else name
+    click.echo(f"{taken}, because {advice.why}; for another model, name an overlay")
+    return compose(name, suited) if advice.overlay else plain
+
+
+def _others(run: Path, named: Recipe) -> list[str]:
+    """What a recipe says otherwise than the one of a run; something if there is no run."""
+    from acwm_core.recipe import Recipe
+    from acwm_core.recipe.recipe import recipe_differences
+    from acwm_core.training.run_folder import RunFolder
+
+    folder = RunFolder(run)
+    if not folder.recipe.is_file():
+        return [f"there is no {run}"]
+    return recipe_differences(Recipe.from_yaml(folder.recipe), named)
 
 
 def _recipe_to_resume(run: Path, words: Sequence[str], out: Path | None) -> Recipe:
@@ -87,6 +117,7 @@ def _recipe_to_resume(run: Path, words: Sequence[str], out: Path | None) -> Reci
         TrainingError: another folder is named.
     """
     from acwm_core.recipe import compose
+    from acwm_core.recipe.advice import advised
     from acwm_core.recipe.recipe import differences
     from acwm_core.training.run_folder import RunFolder, resume_command
 
@@ -97,7 +128,11 @@ def _recipe_to_resume(run: Path, words: Sequence[str], out: Path | None) -> Reci
     has_name = bool(words) and not _OVERRIDE.match(words[0])
     overrides = words[1:] if has_name else words
     kept = compose(folder.recipe, overrides)
+    others: list[str] = []
     if has_name and (others := differences(kept, compose(words[0], overrides), only_set=True)):
+        suited, _ = advised(words[0], overrides)
+        others = differences(kept, compose(words[0], suited), only_set=True)
+    if others:
         raise RecipeError(
             f"the recipe {words[0]} is not the one of {run}: {few(others)}; leave it out, "
             f"`{resume_command(folder)}` continues the run as it was"

@@ -17,6 +17,12 @@ from acwm_core.recipe.text import parse
 OVERLAYS = "overlays"
 """Folder in which ``+NAME`` is looked up: beside the recipe, then among packaged recipes."""
 
+OVERLAY = "+"
+"""What an override begins with that is an overlay."""
+
+ADVISOR = "advisor"
+"""Key of a recipe file that names what advises on overlays, see `acwm_core.recipe.advice`."""
+
 VARIANTS = "paper"
 """Folder of the packaged recipes that vary another one."""
 
@@ -113,11 +119,17 @@ def recipe_summaries() -> dict[str, str]:
     return {name: text.splitlines()[0].lstrip("# ") for name, text in texts.items()}
 
 
+def advisor_of(name: str | Path) -> str | None:
+    """What advises on overlays of this recipe file, if the file itself says so."""
+    named: Any = _content(find_recipe(str(name), Path())).get(ADVISOR)
+    return named if isinstance(named, str) else None
+
+
 def _with_overrides(layers: list[Layer], overrides: Sequence[str], folder: Path) -> list[Layer]:
     """The layers with overlays, of which those in `folder` come first, and with overrides."""
     changes: dict[str, Any] = {}
     for override in overrides:
-        if override.startswith("+"):
+        if override.startswith(OVERLAY):
             layers = _with_file(layers, _find_overlay(override, folder))
         else:
             changes = deep_merge(changes, parse_override(override))
@@ -130,6 +142,7 @@ def _with_file(layers: list[Layer], path: Path, above: tuple[Path, ...] = ()) ->
         raise RecipeError(f"recipes extend each other in a circle: {circle}")
     own = {section: written_out(section, value) for section, value in _content(path).items()}
     extends: Any = own.pop("extends", [])
+    own.pop(ADVISOR, None)
     names = cast(list[Any], extends if isinstance(extends, list) else [extends])
     if not all(isinstance(name, str) for name in names):
         raise RecipeError(f"`extends` in {path} must be a list of recipe files")

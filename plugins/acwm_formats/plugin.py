@@ -73,6 +73,16 @@ def register_formats_of_arrays(registry: Registry) -> None:
 
 
 @hookimpl
+def register_advisors(registry: Registry) -> None:
+    """Add what the recipe `small` asks."""
+    registry.add(
+        "data_report",
+        "acwm_formats.survey.advice:advice_for",
+        summary="by what moves in recordings",
+    )
+
+
+@hookimpl
 def register_commands(registry: Registry) -> None:
     """Add the commands, after `generate`."""
     registry.add(

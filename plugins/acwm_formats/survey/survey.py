@@ -14,9 +14,11 @@ from acwm_core.env.episode import Split
 from acwm_core.evaluation.statistics import MIN_EPISODES
 from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.survey.actions import ActionSummary, action_facts
+from acwm_formats.survey.advice import advice_on
 from acwm_formats.survey.following import SHIFTS, Following, Moments, following
 from acwm_formats.survey.frames import FrameFacts
 from acwm_formats.survey.motion import small
+from acwm_formats.survey.movement import Movement, Movements
 from acwm_formats.survey.near_duplicates import NearDuplicate, near_duplicates
 from acwm_formats.survey.sample import Unread, stretches
 
@@ -59,6 +61,7 @@ class Survey:
         near_duplicates: test episodes that nearly equal training episodes.
         compared: number of test episodes that were compared.
         unread: episodes that cannot be read, of those that were looked at.
+        movement: what moves in the video; None if episodes are too short to say.
         findings: what to know first; the worst come first.
     """
 
@@ -71,6 +74,7 @@ class Survey:
     near_duplicates: list[NearDuplicate]
     compared: int
     unread: Unread
+    movement: Movement | None = None
 
     @property
     def findings(self) -> list[Finding]:
@@ -83,6 +87,7 @@ class Survey:
             *_of_frames(self),
             *_of_duplicates(self),
             *(_of_tests(self.lengths) if self.card.source else ()),
+            *(_of_model(self) if self.card.source and self.movement else ()),
         ]
         return sorted(every, key=lambda finding: ("bad", "note", "good").index(finding.level))
 
@@ -126,9 +131,11 @@ def survey(path: str | Path) -> Survey:
         split: EpisodeDataset(path, split) for split in card.splits
     }
     frames, moments, unread = FrameFacts(), list[Moments](), Unread()
+    movements = Movements()
     for stretch in stretches(data, unread):
         place = stretch.split, stretch.episode
         frames.add((*place, stretch.start), stretch.video, stretch.actions, card.environment.views)
+        movements.add(stretch.video)
         moments.append(Moments(place, stretch.start, small(stretch.video), stretch.actions))
     duplicates, compared = near_duplicates(data, unread)
     return Survey(
@@ -141,6 +148,7 @@ def survey(path: str | Path) -> Survey:
         near_duplicates=duplicates,
         compared=compared,
         unread=unread,
+        movement=movements.summary(),
     )
 
 
@@ -248,6 +256,12 @@ def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
                 f"{split} has {len(episodes)} episodes: an interval and a verdict need "
                 f"{MIN_EPISODES}. Record more, or import again with --test-episodes {MIN_EPISODES}",
             )
+
+
+def _of_model(survey: Survey) -> Iterator[Finding]:
+    advice = advice_on(survey.card, survey.movement)
+    overlay = f" +{advice.overlay}" if advice.overlay else ""
+    yield Finding("good", f"acwm fit small takes small{overlay}: {advice.why}")
 
 
 def _of_duplicates(survey: Survey) -> Iterator[Finding]:
