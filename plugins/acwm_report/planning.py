@@ -88,6 +88,23 @@ def plan(
         return
     if start:
         raise click.UsageError("--start belongs to --goal: leave out TASK, or --start")
+    plan_task(run, task, overrides, seeds, out, compare, rows, preset, videos, landscape, device)
+
+
+def plan_task(
+    run: Path,
+    task: str,
+    overrides: tuple[str, ...],
+    seeds: tuple[int, ...],
+    out: Path | None,
+    compare: bool,
+    rows: tuple[str, ...],
+    preset: str,
+    videos: int,
+    landscape: bool,
+    device: str,
+) -> None:
+    """Play the episodes of a task, or draw their cost landscapes; see `plan`."""
     from acwm_planning.settings import ROW_NAMES, settings_of, words_of
 
     # reports misspelt settings and rows before the slow import of torch
