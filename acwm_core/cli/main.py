@@ -25,6 +25,13 @@ from acwm_core.interrupts import INTERRUPTED
 from acwm_core.plugins import catalog
 from acwm_core.recipe.trust import trust_recipes
 
+EXPECTED = {
+    "resume": "; to continue a run, type `acwm fit resume=RUN`",
+    "train": "; to train a model, type `acwm fit RECIPE`",
+    "import": "; to import recordings, type `acwm data import PATH`",
+}
+"""What to type in place of commands that people expect."""
+
 
 class AcwmGroup(click.Group):
     """A command group that reports errors a user can fix in one sentence on stderr.
@@ -77,7 +84,8 @@ class AcwmGroup(click.Group):
         names = self.list_commands(ctx)
         if args[0] in names or args[0].startswith("-"):
             return super().resolve_command(ctx, args)
-        raise click.UsageError(f"there is no command {args[0]!r}{suggest(args[0], names)}", ctx)
+        near = EXPECTED.get(args[0]) or suggest(args[0], names)
+        raise click.UsageError(f"there is no command {args[0]!r}{near}", ctx)
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> NoReturn:
         """Parse the arguments, run the command and exit."""

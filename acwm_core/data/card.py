@@ -186,6 +186,8 @@ class DatasetCard:
                 return cls.from_dict(values)
         except (yaml.YAMLError, *UNREADABLE) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            if isinstance(error, KeyError):
+                reason = f"it has no {error.args[0]!s:.80}"
             raise DataError(f"{file} is not a dataset card ({reason})") from error
         raise DataError(
             f"{file} has layout version {version}, this acwm reads {FORMAT}: generate it again, "

@@ -209,6 +209,8 @@ def find_recipe(name: str, folder: Path) -> Path:
     for path in (folder / name, folder / file, shipped / file, *sorted(shipped.glob(f"*/{file}"))):
         if path.is_file():
             return path.resolve()
+        if path.exists() and path.suffix:
+            raise RecipeError(f"{path} is not a file: it is a folder, a pipe or a device")
     known = {str(Path(name).parent / path.name) for path in (folder / file).parent.glob("*.yaml")}
     known |= {str(path.relative_to(shipped)) for path in shipped.rglob("*.yaml")}
     if file != name:

@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 
 from acwm_core.errors import RecipeError
-from acwm_core.files import made_whole
+from acwm_core.files import made_whole, training_record
 from acwm_core.plugins import catalog
 from acwm_templates.kinds import KINDS
 
@@ -38,11 +38,12 @@ def write_package(
 
     Raises:
         RecipeError: the name is invalid or taken, or the folder exists.
-        RecipeError: there is no such environment.
+        RecipeError: there is no such environment, or the weights are others.
+        DataError: the weights cannot be read.
     """
     registers = KINDS[kind].registers
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
-        raise RecipeError(f"{name!r} cannot name a {kind}; use snake_case, as in open_drawer")
+        raise RecipeError(f"{name!r} cannot be its name: use snake_case, as in open_drawer")
     whole = f"{environment}.{name}" if kind == "task" else name
     if whole in catalog().registry(registers):
         raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
@@ -52,6 +53,8 @@ def write_package(
     if weights and (kind != "estimator" or not weights.is_file()):
         what = "there is no such file" if kind == "estimator" else f"a {kind} has none"
         raise RecipeError(f"--weights {weights}: {what}")
+    if weights and "layout" not in training_record(weights):
+        raise RecipeError(f"--weights {weights}: `acwm train-estimator` did not write it")
     if folder.exists():
         raise RecipeError(f"{folder} exists already; choose another --out")
     about: dict[str, Any] = {

@@ -1,5 +1,6 @@
 """The command line: help, listings, and errors in one sentence with exit code 2."""
 
+import os
 import re
 import signal
 from pathlib import Path
@@ -80,6 +81,7 @@ def test_show_prints_a_recipe_that_stands_on_its_own(tmp_path: Path) -> None:
 
 def test_mistakes_are_one_sentence() -> None:
     assert "there is no command 'lst'; did you mean 'list'?" in refused("lst")
+    assert "to continue a run, type `acwm fit resume=RUN`" in refused("resume", "runs/mine")
     assert "--size" in refused("generate", "push_cube", "--siz", "64")
     assert "(see acwm show --help)" in refused("show")
     assert "'--episodes': 0" in refused("data", "preview", "--episodes", "0", "nowhere")
@@ -95,6 +97,12 @@ def test_mistakes_are_one_sentence() -> None:
     assert "sets no factor" in refused("generate", "push_cube", "size=64")
     assert "sets no factor" in refused("generate", "push_cube", "factors.friction=[1]")
     assert "'--size': 6a: give a side" in refused("generate", "push_cube", "--size", "6a")
+
+
+def test_a_pipe_is_no_recipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "mine.yaml")
+    for words in (("fit",), ("show",)):
+        assert "mine.yaml is not a file" in refused(*words, tmp_path / "mine.yaml")
 
 
 def test_what_is_not_there_is_one_sentence_that_suggests_another(tmp_path: Path) -> None:

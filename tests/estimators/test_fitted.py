@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from safetensors.numpy import save_file
 
 from acwm_core.cli import main
 from acwm_core.data.dataset import EpisodeDataset
@@ -127,6 +128,17 @@ def test_a_camera_that_did_not_see_the_data_is_refused():
     other = replace(CAMERA, eye=(2.0, 0.0, 1.5))
     with pytest.raises(DataError, match=r"the camera .* shows foot .* away from the mask of mast"):
         fitted_layout(Masts(other, kind="position", instances=("mast",)))
+
+
+def test_weights_that_train_estimator_did_not_write_are_refused(tmp_path):
+    (tmp_path / "text").write_text("root:x:0:0")
+    save_file({"x": np.zeros(3)}, tmp_path / "other")
+    for name in ("text", "other"):
+        words = ["new", "estimator", "mine", "--weights", str(tmp_path / name)]
+        refused = CliRunner().invoke(main, [*words, "--out", str(tmp_path / "mine")])
+        assert refused.exit_code == 2
+        assert refused.stderr.count("\n") == 1
+        assert not (tmp_path / "mine").exists()
 
 
 @pytest.mark.ci
