@@ -22,7 +22,7 @@ from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
 from acwm_formats.mcap_clocks import Stamps, TopicClock, clock_note, times_of
 from acwm_formats.mcap_images import CameraMessages, is_image, is_video
-from acwm_formats.mcap_messages import NumberMessages, Numbers, entries, topics
+from acwm_formats.mcap_messages import MAGIC, NumberMessages, Numbers, entries, topics
 from acwm_formats.names import unread_note, word, words
 from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.timeline import (
@@ -32,8 +32,6 @@ from acwm_formats.timeline import (
     TimedRecording,
     first_sound,
 )
-
-MAGIC = b"\x89MCAP0\r\n"
 
 
 class Log(NamedTuple):

@@ -19,12 +19,15 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 from mcap_ros2.decoder import DecoderFactory as Ros2
 from numpy.typing import NDArray
-from zstandard import frame_content_size
 
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, parse_json
 from acwm_formats.frames import file_stamp
+from acwm_formats.packed import check_packed
+
+MAGIC = b"\x89MCAP0\r\n"
+"""The first and the last bytes of a file."""
 
 _RECORD = struct.Struct("<BQ")
 """The kind of a record, and its length."""
@@ -32,8 +35,6 @@ _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 """How a chunk begins: its times, the bytes that it unpacks to, a checksum, and the length of the
 compression's name, which follows."""
-
-ZSTD = b"\x28\xb5\x2f\xfd"
 
 UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
 """Fields of messages that hold no action."""
@@ -130,22 +131,25 @@ def _decoding(path: Path, channel: Any, decoder: Any, data: bytes) -> Callable[[
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse a log of which a chunk unpacks to far more than it stores.
+    """Refuse a log that is cut off, or of which a chunk unpacks to far more than it stores.
 
     Raises:
-        ValueError: there is one.
+        ValueError: it is.
     """
     size, place = path.stat().st_size, MAGIC_SIZE
     with path.open("rb") as file:
+        file.seek(max(0, size - MAGIC_SIZE))
+        if size < 2 * MAGIC_SIZE or not file.read().startswith(MAGIC):
+            raise ValueError("it is cut off: repair it with `mcap recover`")
         file.seek(place)
         while place < size and len(head := file.read(_RECORD.size)) == _RECORD.size:
             kind, length = _RECORD.unpack(head)
             if kind == Opcode.CHUNK:
-                start = file.read(min(length, 128))
+                start = file.read(length)
                 *_, unpacked, _, named = _CHUNK.unpack_from(start)
                 data = start[_CHUNK.size + named + 8 :]
-                known = frame_content_size(data) if data.startswith(ZSTD) else 0
-                check_unpacked(length, max(unpacked, known))
+                check_unpacked(length, unpacked)
+                check_packed(data)
             place += _RECORD.size + length
             file.seek(place)
 

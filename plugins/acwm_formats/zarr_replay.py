@@ -6,7 +6,7 @@ import contextlib
 import functools
 import itertools
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -14,7 +14,7 @@ from zipfile import ZipFile
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.storage import ZipStore
+from zarr.storage import LocalStore, WrapperStore, ZipStore
 
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError, suggest
@@ -26,6 +26,7 @@ from acwm_formats.format import Format
 from acwm_formats.frames import MOST_FRAMES, stack_note
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import exact, pair, typed, word, words
+from acwm_formats.packed import check_packed
 from acwm_formats.sources import damage_of, guarded
 from acwm_formats.timeline import RecordedDataset
 
@@ -129,6 +130,7 @@ class ZarrReplay(Format):
             buffer.episodes(), layout, exact(rate), pair(pixel_range), channels
         )
         used = {*cameras, *action, *kept}
+        left = [name for name in (*arrays, *buffer.names("SUTO")) if name not in used]
         return RecordedDataset(
             name=word(Path(root)),
             splits=recordings,
@@ -139,9 +141,7 @@ class ZarrReplay(Format):
                 "frames": buffer.ends[-1],
             },
             options=options | {"pixel_range": typed(pixel_range), "follow_links": follow_links},
-            notes=_notes(
-                recordings, [n for n in (*arrays, *buffer.names("SUTO")) if n not in used]
-            ),
+            notes=_notes(buffer, cameras, recordings, left),
             summary=f"The replay buffer {name}",
         )
 
@@ -158,12 +158,36 @@ class ZarrReplay(Format):
         return {"root": place, "rate": 10.0}
 
 
-def _notes(recordings: StoredEpisodes, left: list[str]) -> tuple[str, ...]:
+def _notes(
+    buffer: Buffer, cameras: Iterable[str], recordings: StoredEpisodes, left: list[str]
+) -> tuple[str, ...]:
     """What people should know about how the buffer was read."""
     notes = [f"Arrays that were left out: {', '.join(left)}."] if left else []
+    for name in cameras:
+        array = buffer.array(f"data/{name}")
+        if lacking := array.nchunks - array.nchunks_initialized:
+            notes.append(
+                f"{lacking} of {array.nchunks} chunks of {name} are not stored, and read as "
+                f"{array.fill_value}: a copy may lack files."
+            )
     with contextlib.suppress(DataError):
         notes += stack_note(recordings[0].cameras.values())
     return tuple(notes)
+
+
+class _Checked(WrapperStore[Any]):
+    """A store whose chunks unpack to no more than they may; the decoder would find out too late."""
+
+    async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
+        """The bytes of a key.
+
+        Raises:
+            ValueError: they unpack to far more than they are.
+        """
+        found = await super().get(key, prototype, byte_range)
+        if found is not None:
+            check_packed(memoryview(found.as_numpy_array()).cast("B"))
+        return found
 
 
 class Buffer(ArrayStore):
@@ -181,7 +205,8 @@ class Buffer(ArrayStore):
                 with ZipFile(path) as packed:
                     sizes = (member.file_size for member in packed.infolist())
                     check_unpacked(path.stat().st_size, sum(sizes))
-            store: Any = ZipStore(path, mode="r") if path.is_file() else str(path.absolute())
+            kind: Any = ZipStore if path.is_file() else LocalStore
+            store = _Checked(kind(path.absolute(), read_only=True))
             self._group: Any = zarr.open_group(store, mode="r")
 
     def __reduce__(self) -> Any:

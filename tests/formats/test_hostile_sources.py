@@ -352,6 +352,13 @@ def test_times_that_are_far_off(tmp_path, first):
     assert "take_9" in refused(run("videos", path, tmp_path / "data", options))
 
 
+@pytest.mark.parametrize("size", [8, -1, -50])
+def test_a_log_that_is_cut_off_says_so(tmp_path, size):
+    path, spoilt, options = source(tmp_path, "mcap")
+    spoilt.write_bytes(spoilt.read_bytes()[:size])
+    assert "it is cut off: repair it" in refused(run("mcap", path, tmp_path / "data", options))
+
+
 @pytest.mark.parametrize("lies", [False, True])
 def test_chunks_of_a_log_that_unpack_to_gigabytes(tmp_path, lies):
     path, spoilt, options = source(tmp_path, "mcap")

@@ -5,13 +5,17 @@ import pickle
 import zipfile
 
 import h5py
+import numcodecs
 import numpy as np
 import pytest
 import zarr
 
+import acwm_core.arrays
 from acwm_core.errors import DataError
+from acwm_formats import packed
 from acwm_formats.hdf5 import HDF5
 from acwm_formats.minari_datasets import Minari
+from acwm_formats.packed import GZIP, ZSTD, check_packed, zstd_size
 from acwm_formats.zarr_replay import ZarrReplay
 from tests.formats.corpus import arrays
 from tests.formats.corpus.cases import Case, three
@@ -72,6 +76,40 @@ def test_codecs_that_run_code_are_refused(tmp_path, codec):
         chunk.write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(DataError, match=codec):
         ZarrReplay().read(path, **options)
+
+
+@pytest.mark.parametrize("codec", ["zstd", "gzip", "bz2", "zlib"])
+def test_chunks_that_unpack_to_gigabytes_are_refused(tmp_path, monkeypatch, codec):
+    for module in (acwm_core.arrays, packed):
+        monkeypatch.setattr(module, "LARGE", 2**20)  # in place of 256 MB
+    path, options = arrays.replay(tmp_path, PLAIN)
+    described = json.loads((path / "data/img/.zarray").read_text())
+    described |= {"compressor": {"id": codec, "level": 1}, "filters": None}
+    (path / "data/img/.zarray").write_text(json.dumps(described))
+    bomb = numcodecs.get_codec({"id": codec, "level": 1}).encode(bytes(3 * 2**20))
+    for chunk in (path / "data/img").glob("[0-9]*"):
+        chunk.write_bytes(bomb)
+    recording = ZarrReplay().read(path, **options).splits[0]
+    with pytest.raises(DataError, match="claim to hold"):
+        next(iter(recording.cameras["img"].read([0])))
+
+
+@pytest.mark.parametrize("codec", ["zstd", "gzip", "bz2", "zlib", "lz4", "lzma"])
+def test_sound_chunks_are_read(codec):
+    rng = np.random.default_rng(0)
+    for data in (bytes(10**6), rng.bytes(10**5), b""):
+        check_packed(numcodecs.get_codec({"id": codec}).encode(data))
+        check_packed(ZSTD + data)
+        check_packed(GZIP + data)
+    whole = numcodecs.get_codec({"id": "zstd"}).encode(rng.bytes(10**6))
+    assert zstd_size(whole) == 10**6
+
+
+def test_chunks_that_a_copy_lacks_are_named(tmp_path):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    (path / "data/img/1.0.0.0").unlink()
+    (note,) = ZarrReplay().read(path, **options).notes
+    assert "1 of 7 chunks of img are not stored, and read as 0" in note
 
 
 def test_texts_are_named_and_hidden_arrays_are_not_read(tmp_path):
