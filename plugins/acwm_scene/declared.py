@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from acwm_core.env.camera import Camera
 from acwm_core.env.card import EnvironmentCard, StateField
 from acwm_core.env.rotations import FOLDS
-
-if TYPE_CHECKING:
-    from acwm_scene.group import Group
 
 Kind = Literal["values", "bodies", "nodes"]
 
@@ -65,17 +62,6 @@ class GroupSpec:
     nodes: tuple[int, ...] = ()
     camera: Camera | None = None
     light: tuple[float, float, float] | None = None
-
-    def build(self, **options: Any) -> Group:
-        """The group, with fresh weights."""
-        # Imported here, as groups take their specs from this module.
-        if self.kind == "values":
-            from acwm_scene.values import ValueGroup as Kind
-        elif self.kind == "bodies":
-            from acwm_scene.bodies import BodyGroup as Kind
-        else:
-            from acwm_scene.node_group import NodeGroup as Kind
-        return Kind(self, **options)
 
 
 def groups_of(card: EnvironmentCard | None, states: Sequence[str]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -16,11 +16,21 @@ from acwm_core.model.batch import noise_of_clips, to_device
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Keypoints, LatentStream, ModelInputs, Predictor
 from acwm_core.model.shapes import Latent
+from acwm_scene.bodies import BodyGroup
 from acwm_scene.declared import GroupSpec, default_states, groups_of
 from acwm_scene.group import Group, at_frame, flattened, picked, stacked, tree_map
 from acwm_scene.layers import FrameDrawing, MatrixConv
+from acwm_scene.node_group import NodeGroup
 from acwm_scene.points import PointGroup
 from acwm_scene.upgrade import upgraded
+from acwm_scene.values import ValueGroup
+
+GROUPS: Mapping[str, Callable[..., Group]] = {
+    "values": ValueGroup,
+    "bodies": BodyGroup,
+    "nodes": NodeGroup,
+}
+"""What makes a group of a kind from its `GroupSpec`."""
 
 
 class Scene(NamedTuple):
@@ -113,7 +123,7 @@ class SceneDynamics(Predictor):
         sizes = {"latent_channels": latent_channels, "stride": temporal_stride}
         sizes |= {"channels": channels, "width": width, "noise": noise}
         options = {"stretch": stretch, "unit": unit, "every": every}
-        groups = {name: spec.build(**sizes, **options) for name, spec in specs.items()}
+        groups = {name: GROUPS[spec.kind](spec, **sizes, **options) for name, spec in specs.items()}
         self.point_size = 0
         if points:
             groups["points"] = group = PointGroup(points, **sizes)
@@ -157,7 +167,7 @@ class SceneDynamics(Predictor):
 
     def upgrade(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weights of the models that scenes replace, under their present names."""
-        return upgraded(weights, self)
+        return upgraded(weights, self.columns, self.state_dict())
 
     # Reading, moving, drawing ------------------------------------------------------------------
 

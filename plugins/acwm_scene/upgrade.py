@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping
 
 from torch import Tensor
 
 from acwm_core.errors import AcwmWarning
-
-if TYPE_CHECKING:
-    from acwm_scene.scene import SceneDynamics
 
 PAINTERS = {
     "bodies": ("agents", "bodies", "vector", "then", "now"),
@@ -20,15 +17,22 @@ PAINTERS = {
 """Parts of the former `drawing` that the painter of each group has now."""
 
 
-def upgraded(weights: dict[str, Tensor], model: SceneDynamics) -> dict[str, Tensor]:
-    """The weights as the model has them; those of scenes stay as they are.
+def upgraded(
+    weights: dict[str, Tensor], groups: Collection[str], own: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """The weights as a scene with these groups has them; those of scenes stay as they are.
 
     The former models had no scale of states among their weights. Where one is missing, it stays
     unknown, which is a warning: states can then not be predicted.
+
+    Args:
+        weights: by name.
+        groups: names of the scene's groups.
+        own: the weights that the scene has now.
     """
     if any(name.startswith("groups.") for name in weights):
         return weights
-    (group,) = model.columns
+    (group,) = groups
     moved = {_renamed(name, group): values for name, values in weights.items()}
     if group == "values":
         warnings.warn(
@@ -38,7 +42,6 @@ def upgraded(weights: dict[str, Tensor], model: SceneDynamics) -> dict[str, Tens
             AcwmWarning,
             stacklevel=2,
         )
-    own = model.state_dict()
     missing = {name: own[name] for name in own.keys() - moved.keys() if name.endswith(SCALES)}
     return moved | missing
 
