@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import errno
 import functools
 import glob
@@ -46,6 +47,9 @@ FULL = 2**20
 
 MOST_VALUES = 1_000_000
 """Most values that a YAML file may hold, with those that its aliases repeat."""
+
+KEPT_TEXT = 20_000
+"""Most characters of a YAML file whose content is kept for the next time that it is read."""
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 """How a file begins that Git LFS puts in the place of one that it has not fetched."""
@@ -495,7 +499,20 @@ def parse_yaml(text: str, loader: Any = None) -> Any:
     """
     import yaml
 
-    reader: Any = cast(Any, loader or yaml.SafeLoader)(text)
+    loader = loader or yaml.SafeLoader
+    if len(text) > KEPT_TEXT:
+        return _parsed(text, loader)
+    return copy.deepcopy(_kept(text, loader))
+
+
+@functools.lru_cache(maxsize=256)
+def _kept(text: str, loader: Any) -> Any:
+    """What a text says: recipes, overlays and cards are read again and again, and slowly."""
+    return _parsed(text, loader)
+
+
+def _parsed(text: str, loader: Any) -> Any:
+    reader: Any = loader(text)
     try:
         node = reader.get_single_node()
         if node is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,23 +24,10 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
     A dataset hub shows it: YAML for the hub, then Markdown for people. Equal datasets get equal
     pages.
     """
-    import jinja2
-
-    def cell(text: object) -> str:
-        return str(text).replace("|", "\\|").replace("\n", " ")
-
     path = folder / README
     if path.exists() and MARK.encode() not in path.read_bytes():
         return
-    pages = jinja2.Environment(
-        loader=jinja2.PackageLoader("acwm_core.data", "."),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    cast(Any, pages).filters["cell"] = cell
-    page = pages.get_template("readme.md.j2").render(
+    page = _template().render(
         card=card,
         environment=card.environment,
         splits={split: Manifest(folder / split).ordered() for split in card.splits},
@@ -49,6 +37,24 @@ def write_readme(folder: Path, card: DatasetCard) -> None:
     )
     with written_whole(path) as partial:
         partial.write_text(page, encoding="utf-8")
+
+
+@functools.cache
+def _template() -> Any:
+    import jinja2
+
+    def cell(text: object) -> str:
+        return str(text).replace("|", "\\|").replace("\n", " ")
+
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("acwm_core.data", "."),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    cast(Any, pages).filters["cell"] = cell
+    return pages.get_template("readme.md.j2")
 
 
 def _front_matter(card: DatasetCard) -> str:

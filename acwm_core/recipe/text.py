@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import functools
 import re
 from typing import Any
 
@@ -24,7 +22,7 @@ def parse(text: str, origin: str) -> Any:
         RecipeError: it is not valid YAML; says where and why.
     """
     try:
-        return copy.deepcopy(_parsed(text))
+        return parse_yaml(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark and "\n" in text.strip() else ""
@@ -32,12 +30,6 @@ def parse(text: str, origin: str) -> Any:
     except (yaml.YAMLError, ValueError) as error:  # e.g. a number of 5,000 digits
         why = str(error).splitlines()[0]
         raise RecipeError(f"{origin} is not valid YAML: {why}") from error
-
-
-@functools.lru_cache(maxsize=256)
-def _parsed(text: str) -> Any:
-    """What a text says; overlays and `base.yaml` are read again and again, and slowly."""
-    return parse_yaml(text, _Loader)
 
 
 def dump(values: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import json
 import re
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ def checked(where: str, value: Any, expected: Any) -> Any:
     import pydantic  # 60 ms, and only if a recipe sets something
 
     try:
-        adapter = pydantic.TypeAdapter[Any](expected)
+        adapter = _adapter(expected)
     except pydantic.errors.PydanticUserError:
         return value
     try:
@@ -52,6 +53,21 @@ def checked(where: str, value: Any, expected: Any) -> Any:
         raise RecipeError(f"{where}={show(value)}: expected {wanted}{hint}") from None
     except (TypeError, ValueError):  # it is not of JSON types
         raise RecipeError(f"{where}={value}: expected {describe(expected)}") from None
+
+
+def _adapter(expected: Any) -> Any:
+    try:
+        return _kept_adapter(expected)
+    except TypeError:  # `Annotated` by something without a hash
+        return _kept_adapter.__wrapped__(expected)
+
+
+@functools.lru_cache(maxsize=1024)
+def _kept_adapter(expected: Any) -> Any:
+    """What checks a type; to make it takes longer than to check a hundred values."""
+    import pydantic
+
+    return pydantic.TypeAdapter[Any](expected)
 
 
 def show(value: Any) -> str:
