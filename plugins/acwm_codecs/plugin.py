@@ -33,7 +33,7 @@ def register_codecs(registry: Registry) -> None:
     registry.add(
         "compact_per_frame",
         "acwm_codecs.compact_per_frame:CompactPerFrame",
-        summary="the same weights with every frame by itself: strides 8×8, 16 channels",
+        summary="the same weights, applied to each frame alone: strides 8×8, 16 channels",
     )
     lossless = "lossless: folds blocks of pixels and frames into channels, nothing learned"
     registry.add("identity", "acwm_codecs.identity:Identity", summary=lossless)

@@ -51,7 +51,7 @@ class Log(NamedTuple):
 
 
 class MCAP(Format):
-    """MCAP files with messages in JSON, ROS 2 or Protobuf; only read."""
+    """MCAP files with messages in JSON, ROS 2 or Protobuf; read only."""
 
     @classmethod
     def detect(cls, path: Path) -> bool:

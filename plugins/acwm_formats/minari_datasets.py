@@ -45,7 +45,7 @@ MAIN = "main_data.hdf5"
 
 
 class Minari(Format):
-    """Minari datasets with images in their observations; only read."""
+    """Minari datasets with images in their observations; read only."""
 
     @classmethod
     def detect(cls, path: Path) -> bool:

@@ -20,27 +20,27 @@ def register_formats(registry: Registry) -> None:
     registry.add(
         "videos",
         "acwm_formats.videos:Videos",
-        summary="a folder of videos or pictures, with tables of actions; only read",
+        summary="a folder of videos or pictures, with tables of actions; read only",
     )
     registry.add(
         "lerobot",
         "acwm_formats.lerobot:LeRobot",
-        summary="a LeRobot dataset of version 3.0 or 2.x; written as 3.0, visually lossless",
+        summary="a LeRobot dataset of version 3.0 or 2.x; written as 3.0, visually losslessly",
     )
     registry.add(
         "gymnasium",
         "acwm_formats.rollouts:Gymnasium",
-        summary="rollouts of a Gymnasium environment; only read",
+        summary="rollouts of a Gymnasium environment; read only",
     )
     registry.add(
         "acwm-phys",
         "acwm_formats.published:Published",
-        summary="the layout of the published ACWM-Phys release; written visually lossless",
+        summary="the layout of the published ACWM-Phys release; written visually losslessly",
     )
     registry.add(
         "hdf5",
         "acwm_formats.hdf5:HDF5",
-        summary="robomimic, LIBERO, ACT/ALOHA, any other layout; written with every bit",
+        summary="robomimic, LIBERO, ACT/ALOHA, any other layout; written losslessly",
         extra="hdf5",
         requires=("h5py",),
     )
@@ -52,21 +52,21 @@ def register_formats_of_arrays(registry: Registry) -> None:
     registry.add(
         "zarr",
         "acwm_formats.zarr_replay:ZarrReplay",
-        summary="a replay buffer as diffusion policy publishes it; only read",
+        summary="a replay buffer as diffusion policy publishes it; read only",
         extra="zarr",
         requires=("zarr",),
     )
     registry.add(
         "minari",
         "acwm_formats.minari_datasets:Minari",
-        summary="a dataset of Minari with images; only read",
+        summary="Minari datasets with images; read only",
         extra="minari",
         requires=("minari", "h5py"),
     )
     registry.add(
         "mcap",
         "acwm_formats.mcap_logs:MCAP",
-        summary="logs with images or video and a topic of numbers; only read",
+        summary="logs with images or video and a topic of numbers; read only",
         extra="mcap",
         requires=("mcap", "mcap_ros2", "mcap_protobuf"),
     )

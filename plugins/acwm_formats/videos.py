@@ -86,7 +86,7 @@ class Columns(NamedTuple):
 
 
 class Videos(Format):
-    """Videos or folders of pictures, with actions in tables beside them; only read."""
+    """Videos or folders of pictures, with actions in tables beside them; read only."""
 
     @classmethod
     def detect(cls, path: Path) -> bool:

@@ -68,7 +68,7 @@ MOST_LOOKED_AT = 1000  # files
 
 
 class ZarrReplay(Format):
-    """Zarr replay buffers as diffusion policy publishes them; only read."""
+    """Zarr replay buffers as diffusion policy publishes them; read only."""
 
     @classmethod
     def detect(cls, path: Path) -> bool:

@@ -54,17 +54,17 @@ def register_costs(registry: Registry) -> None:
     registry.add(
         "latent",
         "acwm_planning.costs:LatentDistance",
-        summary="distance of latents to that of the goal's picture",
+        summary="distance between the latents of the prediction and of the goal's picture",
     )
     registry.add(
         "state",
         "acwm_planning.costs:StateDistance",
-        summary="the task's distance, of states that an estimator reads",
+        summary="the task's distance between states that an estimator reads",
     )
     registry.add(
         "points",
         "acwm_planning.costs:KeypointDistance",
-        summary="distance of the points that a model sees to those in the goal's picture",
+        summary="distance between the points that a model finds in both pictures",
     )
     registry.add(
         "callable",

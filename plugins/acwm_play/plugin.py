@@ -19,7 +19,7 @@ def register_drivers(registry: Registry) -> None:
     registry.add(
         "planner",
         "acwm_play.planning_driver:PlanningDriver",
-        summary="plans with the model that is played",
+        summary="plans with the model in play",
     )
 
 

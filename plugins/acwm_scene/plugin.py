@@ -36,5 +36,5 @@ def register_objectives(registry: Registry) -> None:
     registry.add(
         "scene",
         "acwm_scene.objective:SceneObjective",
-        summary="reading and drawing from pictures, motion from states and actions alone",
+        summary="learns to read and draw from pictures, and motion from states and actions alone",
     )

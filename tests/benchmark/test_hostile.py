@@ -18,6 +18,7 @@ from acwm_benchmark.tasks import Tasks
 from acwm_core.cli import main
 from acwm_core.errors import DataError
 from tests.benchmark.participant import WRITERS
+from tests.formats import video_bombs
 
 CLIP = "slide/ood_test-000002"
 GREY = np.full((9, 32, 32, 3), 0.5, np.float32)
@@ -126,6 +127,11 @@ PICTURES = {
     "large.gif": large_gif,
     "long.gif": lambda: gif((32, 32), duration=655_350),
     "many.gif": lambda: gif((32, 32), frames=3000),
+    "samples.mp4": video_bombs.BOMBS["samples.mp4"],
+    "fragment.mp4": video_bombs.BOMBS["fragment.mp4"],
+    "edits.mp4": video_bombs.BOMBS["edits.mp4"],
+    "ffv1.mkv": video_bombs.BOMBS["ffv1.mkv"],
+    "raw.avi": video_bombs.BOMBS["raw.avi"],
     "playlist.mp4": lambda: b"#EXTM3U\nfile:///etc/passwd\n",
     "program.gif": lambda: b"%!PS\n{ } loop\n",
     "program.png": lambda: b"%!PS\n{ } loop\n",
