@@ -16,7 +16,7 @@ from torch import Tensor
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import TrainingError, suggest
-from acwm_core.files import check_fetched, written_whole
+from acwm_core.files import check_fetched, parse_json, written_whole
 from acwm_core.model.build import build_world_model
 from acwm_core.model.shapes import check_finite, float32_by_default
 from acwm_core.model.world_model import WorldModel
@@ -132,13 +132,17 @@ def read_metadata(path: Path) -> dict[str, Any]:
     try:
         with cast(Any, safetensors.safe_open)(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
-        facts: dict[str, Any] = json.loads(metadata.get("acwm", "{}"))
+        facts = parse_json(metadata.get("acwm", "{}"))
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         check_fetched(path)
         raise TrainingError(f"{path} cannot be read as safetensors: {error}") from None
-    if facts.get("format") != FORMAT:
+    known = cast(dict[str, Any], facts) if isinstance(facts, dict) else {}
+    kinds = {"step": int, "codec": str | None, "sha256": str | None}
+    if known.get("format") != FORMAT or not all(
+        isinstance(known.get(name), kind) for name, kind in kinds.items()
+    ):
         raise TrainingError(f"{path} was not written by this version of acwm")
-    return facts
+    return known
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:
@@ -151,7 +155,7 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
     """
     facts = read_metadata(path)
     own = world_model.codec.latents_fingerprint()
-    if facts["codec"] not in (None, own):
+    if facts.get("codec") not in (None, own):
         raise TrainingError(
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
             f"{own}): restore that codec or train again"

@@ -79,6 +79,17 @@ def test_folders_that_hold_no_run_are_refused(tmp_path, copy):
         load_run(copy.path)
 
 
+@pytest.mark.parametrize(
+    "facts",
+    ["[]", "[" * 10**5, "9" * 5000, '{"format": 1}', '{"format": 1, "step": 3, "codec": [7]}', "x"],
+)
+def test_weights_that_say_odd_things_of_themselves(tmp_path, facts):
+    path = tmp_path / "model.safetensors"
+    safetensors.torch.save_file({"model.x": torch.zeros(1)}, path, metadata={"acwm": facts})
+    with pytest.raises(TrainingError, match=r"not written by this version|cannot be read"):
+        read_metadata(path)
+
+
 def test_tied_weights_come_back(tmp_path):
     """Such as an embedding that is the output layer, too; safetensors refuses shared memory."""
 
