@@ -99,3 +99,11 @@ def test_what_is_missing_is_said(sighted, capsys, tmp_path):
     ):
         code, _, err = acwm(capsys, "plan", sighted, *words)
         assert (code, said in err) == (2, True), err
+
+
+def test_points_of_a_model_without_any_are_refused(tmp_path, capsys):
+    run = tiny.make_exact_run(tmp_path / "run")
+    code, _, err = acwm(capsys, "plan", run, "place", *FEW, "cost=points")
+    assert code == 2
+    assert err.splitlines()[-1].startswith("acwm: ")
+    assert "sees no points to compare: take cost=latent" in err.splitlines()[-1]

@@ -20,7 +20,7 @@ def written(world, path):
 
 def test_points_go_on_learning_on_other_data(tmp_path):
     first = world_of(model_of_balls(), stride=1)
-    learn_points(first.model, clips_of(balls(32, seed=1)[0]), 25)
+    learn_points(first.model, clips_of(balls(32, seed=1)[0]), 15)
     file, losses = written(first, tmp_path / "w.safetensors"), []
     others = clips_of(balls(32, seed=2)[0] + OTHER)
     for start in (None, file):
