@@ -119,11 +119,14 @@ class ShardRecord:
         """Read what `to_json` wrote.
 
         Raises:
-            ValueError: it is not a record, or its shard lies in another folder.
+            ValueError: it is not a record, its shard lies in another folder, or claims more frames
+                than it has bytes.
         """
         record = typed(parse_json(line), cls)
         if not SHARD.fullmatch(record.shard):
             raise ValueError(f"{record.shard!r} is not the name of a shard")
+        if min(record.lengths, default=1) < 1 or not 0 <= record.frames <= record.size:
+            raise ValueError(f"{record.shard} cannot hold episodes of {record.frames:,} frames")
         return record
 
 

@@ -59,6 +59,9 @@ def test_states_under_names_that_lead_out_are_refused(data):
         ({"shard": "../../../etc/passwd"}, "not the name of a shard"),
         ({"shard": "/etc/passwd"}, "not the name of a shard"),
         ({"shard": "shard-00000.tar/../../x"}, "not the name of a shard"),
+        ({"shard": "shard-00000.tar\n"}, "not the name of a shard"),
+        ({"lengths": [10**12]}, "cannot hold episodes of 1,000,000,000,000 frames"),
+        ({"lengths": [30, -1]}, "cannot hold episodes of 29 frames"),
     ],
 )
 def test_manifests_that_mislead_are_refused(data, change, problem):
