@@ -247,7 +247,7 @@ def _sound(path: Path, container: Any, stream: Any) -> Iterator[Any]:
     """Decode, and report damage instead of concealing it."""
     context = stream.codec_context
     context.options = {"err_detect": "explode", **LIMITS}
-    most = context.height * context.width
+    most = context.height * context.width or MOST_PIXELS
     for frame in container.decode(stream):
         if frame.height * frame.width > most:
             raise DataError(f"the video {path} has larger frames from {frame.time or 0:.3f} s on")
