@@ -44,8 +44,8 @@ SAMPLES = 1500
 """Frames that a layout is found from."""
 
 AWAY = 0.15
-"""Median distance, in frame heights, between where a declared camera shows a position and its mask,
-above which it is another camera."""
+"""Median distance, in frame heights, between the place at which a declared camera shows a position
+and the box around its mask, above which it is another camera."""
 
 LEAST = 0.002
 """Share of the frame that a mask must cover for its middle to count."""
@@ -92,8 +92,9 @@ def fitted_layout(
             plane = field.height if field.shape[-1] == 2 else None
             points.append(Points(field.name, names, plane, field.present))
             pairs += [(rows[:, row], middles[name]) for row, name in enumerate(names)]
-            if card.camera is not None:
-                _check_seen(card.camera, points[-1], pairs[-len(names) :])
+            for row, name in enumerate(names) if card.camera else ():
+                shown = masks == card.instances.index(name)
+                _check_seen(card.camera, points[-1], rows[:, row], shown, name)
     if not points:
         raise DataError(
             f"no position in the states of {dataset.path} follows a mask: its states are "
@@ -172,17 +173,28 @@ def _owners(field: StateField, rows: Array, middles: Mapping[str, Array]) -> lis
     return [_owner(rows[:, row], middles) for row in range(rows.shape[1])]
 
 
-def _check_seen(camera: Camera, points: Points, pairs: Sequence[tuple[Array, Array]]) -> None:
-    """Refuse a camera that shows positions far from the masks of their bodies."""
-    for name, (values, middle) in zip(points.instances, pairs, strict=True):
-        seen = camera.to_frame(lifted(values, points.plane))[:, :2]
-        away = np.linalg.norm(seen - middle, axis=1)
-        there = np.isfinite(away)
-        if there.sum() >= FEWEST and (off := float(np.median(away[there]))) > AWAY:
-            raise DataError(
-                f"the camera that the card declares shows {points.field} {off:.2f} frame heights "
-                f"away from the mask of {name}: correct the camera, or declare none"
-            )
+def _check_seen(
+    camera: Camera | None, points: Points, values: Array, mask: NDArray[np.bool_], name: str
+) -> None:
+    """Refuse a camera that shows a position `[F, D]` far from the mask `[F, H, W]` of its body."""
+    if camera is None:
+        return
+    height, width = mask.shape[1:]
+    there = mask.mean((1, 2)) >= LEAST
+    if there.sum() < FEWEST:
+        return
+    pixels = camera.project(lifted(values[there], points.plane), height, width)[:, :2]
+    edges = [
+        np.stack([shown.argmax(1), shown.shape[1] - shown[:, ::-1].argmax(1)], -1)
+        for shown in (mask[there].any(axis) for axis in (1, 2))
+    ]
+    low, high = np.moveaxis(np.stack(edges, 1), -1, 0)
+    away = np.linalg.norm(np.maximum(0, np.maximum(low - pixels, pixels - high)), axis=1) / height
+    if (off := float(np.nanmedian(away))) > AWAY:
+        raise DataError(
+            f"the camera that the card declares shows {points.field} {off:.2f} frame heights away "
+            f"from the mask of {name}: correct the camera, or declare none"
+        )
 
 
 def _owner(values: Array, middles: Mapping[str, Array]) -> str | None:

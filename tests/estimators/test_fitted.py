@@ -124,8 +124,18 @@ def test_positions_lie_where_the_declared_camera_says(declared):
     assert np.linalg.norm(fitted[0, 0, :2] * 32 + 16 - pixel[:2]) > 1  # it knows the masks alone
 
 
+def test_a_long_body_is_no_other_camera():
+    """Its place may be far from the middle of its mask."""
+    masts = Masts(CAMERA, kind="position", instances=("mast",))
+    for episode in masts:
+        for mask, foot in zip(episode.masks, episode.states["foot"], strict=True):
+            x, y, _ = CAMERA.project(np.array([*foot, 0.1]), 32, 32)
+            mask[: int(y), int(x)] = 1  # up to the ceiling
+    assert fitted_layout(masts).camera == CAMERA
+
+
 def test_a_camera_that_did_not_see_the_data_is_refused():
-    other = replace(CAMERA, eye=(2.0, 0.0, 1.5))
+    other = replace(CAMERA, target=(1.2, 0.0, 0.2))
     with pytest.raises(DataError, match=r"the camera .* shows foot .* away from the mask of mast"):
         fitted_layout(Masts(other, kind="position", instances=("mast",)))
 
