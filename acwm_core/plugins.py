@@ -465,11 +465,15 @@ class Catalog:
         for point in self._entry_points():
             with self._reporting(point):
                 loaded.append((point, point.load()))
-        name_of = functools.cache(lambda distribution: distribution and distribution.name)
+
+        @functools.cache  # a distribution reads its file again for each answer
+        def name_of(distribution: importlib.metadata.Distribution | None) -> str | None:
+            return distribution.name if distribution else None
+
         for point, plugin in sorted(
             loaded, key=lambda entry: not hasattr(entry[1], "register_kinds")
         ):
-            with self._reporting(point):  # a distribution reads its file again for each answer
+            with self._reporting(point):
                 self.add_plugin(plugin, point.name, name_of(point.dist))
 
     @contextlib.contextmanager

@@ -24,9 +24,9 @@ def body_lines(function):
     return body[-1].end_lineno - body[0].lineno + 1 if body else 0
 
 
-def functions(text):
+def functions(tree):
     kinds = ast.FunctionDef | ast.AsyncFunctionDef
-    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+    return [node for node in ast.walk(tree) if isinstance(node, kinds)]
 
 
 @pytest.fixture(scope="module")
@@ -34,21 +34,26 @@ def sources():
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in CODE}
 
 
+@pytest.fixture(scope="module")
+def trees(sources):
+    return {name: ast.parse(text) for name, text in sources.items()}
+
+
 @pytest.mark.ci
-def test_functions_are_short(sources):
+def test_functions_are_short(trees):
     found = {
-        f"{name}:{f.name}": body_lines(f) for name, text in sources.items() for f in functions(text)
+        f"{name}:{f.name}": body_lines(f) for name, tree in trees.items() for f in functions(tree)
     }
     assert {name: n for name, n in found.items() if n > FUNCTION_LINES} == {}
 
 
 @pytest.mark.ci
-def test_text_has_an_encoding(sources):
+def test_text_has_an_encoding(trees):
     """Without one, what is read and written depends on the user's locale."""
     bare = []
-    for name, text in sources.items():
+    for name, tree in trees.items():
         if name.startswith(("acwm_core/", "plugins/")) and "/templates/" not in name:
-            for call in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
+            for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
                 method = getattr(call.func, "attr", "")
                 most = {"read_text": 0, "write_text": 1}.get(method, len(call.args) - 1)
                 told = len(call.args) > most or any(k.arg == "encoding" for k in call.keywords)
@@ -71,13 +76,13 @@ def test_no_large_file_is_tracked():
     assert all(size <= 10 * 2**20 for size in large.values())
 
 
-def test_pictures_are_opened_by_their_kinds(sources):
+def test_pictures_are_opened_by_their_kinds(sources, trees):
     """Pillow opens kinds that are programs, unless it is told which it may expect."""
     bare = []
     for name, text in sources.items():
         if not name.startswith("tests/") and "Image.open(" in text:
-            for call in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
-                if ast.unparse(call.func) == "Image.open":
-                    kinds = any(keyword.arg == "formats" for keyword in call.keywords)
-                    bare += [] if kinds else [f"{name}:{call.lineno}"]
+            calls = (node for node in ast.walk(trees[name]) if isinstance(node, ast.Call))
+            for call in (each for each in calls if ast.unparse(each.func) == "Image.open"):
+                kinds = any(keyword.arg == "formats" for keyword in call.keywords)
+                bare += [] if kinds else [f"{name}:{call.lineno}"]
     assert bare == []
