@@ -241,6 +241,32 @@ class DynamicsChecks(PredictionTrial):
         error = batch_error(usual[:1].nan_to_num(), alike[:1].nan_to_num())
         expect(error < 1e-3, "a beginning that all clips share gives other states")
 
+    @torch.no_grad()
+    def carries_the_states_that_it_predicts(self) -> None:
+        """Compare `carry_states`, of scenes that are picked and put too, with `predict_states`."""
+        model = self._model
+        if not (isinstance(model, Predictor) and model.implements("carry_states")):
+            raise NotTried("it carries no states")
+        latents, modulation = self._inputs()
+        batch, frames = SHAPE[:2]
+        clip, conditioning = latents[:, :1], probed(modulation)
+        try:
+            whole = model.predict_states(clip, conditioning, frames, draws(batch))
+            begun = model.carry_states(clip, draws(batch))
+        except RecipeError as error:  # it has yet to measure them
+            raise NotTried(str(error)) from None
+        carried, last = begun.picked(torch.arange(batch)), torch.tensor([batch - 1])
+        steps = [conditioning.frames(frame - 1, frame + 1) for frame in range(1, frames)]
+        passed = torch.cat([carried.advance(step) for step in steps], 1)
+        error = batch_error(whole.nan_to_num(), passed.nan_to_num())
+        expect(error < 1e-3, f"the carried states differ by {error:.2g}")
+        now = carried.current.allclose(passed[:, -1], 1e-4, 1e-4, equal_nan=True)
+        expect(now, "`current` is not the last of the states")
+        carried.put(last, begun.picked(last))  # one begins anew while the others go on
+        passed = torch.cat([carried.advance(step) for step in steps], 1)
+        error = batch_error(whole[last].nan_to_num(), passed[last].nan_to_num())
+        expect(error < 1e-3, f"the states of a scene that begins anew differ by {error:.2g}")
+
 
 class DenoiserChecks(Suite):
     """Checks of a denoiser on random latents."""

@@ -239,6 +239,10 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             "ood_label": self._ood_label,
         }
 
+    def observe_state(self) -> dict[str, NDArray[Any]]:
+        """The fields of the state now, by name, as in `info`, without rendering."""
+        return self._state()
+
     def still_action(self) -> NDArray[np.float32]:
         """The raw action `[A]` that commands no motion now: zero, clipped to the action bounds.
 

@@ -326,7 +326,23 @@ class Predictor(DynamicsModel):
         """
         raise RecipeError(f"{type(self).__name__} has no `stream`, so it cannot be streamed")
 
-    def implements(self, method: Literal["predict_frames", "predict_states", "stream"]) -> bool:
+    def carry_states(self, given: Latent, generators: Sequence[Generator] = ()) -> CarriedStates:
+        """Predict states one latent frame at a time, without end and without pictures. Optional.
+
+        The states are those of `predict_states`.
+
+        Args:
+            given: the first K ≥ 1 latent frames, `[B, K, C, h, w]`.
+            generators: as in `forward`.
+
+        Raises:
+            RecipeError: the model does not carry states.
+        """
+        raise RecipeError(f"{type(self).__name__} carries no states from frame to frame")
+
+    def implements(
+        self, method: Literal["predict_frames", "predict_states", "stream", "carry_states"]
+    ) -> bool:
         """Whether the model has one of the optional abilities."""
         return getattr(type(self), method) is not getattr(Predictor, method)
 
@@ -343,6 +359,34 @@ class LatentStream(ABC):
                 given frames and the next one. The embedding of the last frame may have changed, as
                 a conditioner may look one step ahead.
         """
+
+
+class CarriedStates(ABC):
+    """The states of B scenes side by side, which actions move, in constant memory.
+
+    Scenes do not depend on each other, and may have begun at different times.
+    """
+
+    @property
+    @abstractmethod
+    def current(self) -> Tensor:
+        """The states in the last video frame, `[B, S]`, as `predict_states` returns them."""
+
+    @abstractmethod
+    def advance(self, conditioning: Conditioning) -> Tensor:
+        """The states in the video frames of the next latent frame, `[B, stride, S]`.
+
+        Args:
+            conditioning: of the last latent frame and the next one, of B scenes.
+        """
+
+    @abstractmethod
+    def picked(self, rows: Tensor) -> CarriedStates:
+        """A copy of some of the scenes, by their numbers `[N]`, each as often as it is named."""
+
+    @abstractmethod
+    def put(self, rows: Tensor, others: CarriedStates) -> None:
+        """Replace the scenes of these numbers `[N]` by the N scenes of others."""
 
 
 class Cache(ABC):

@@ -16,6 +16,7 @@ from acwm_core.model.conditioner import Conditioner, Conditioning
 from acwm_core.model.dynamics import DynamicsModel, Keypoints, Predictor, hidden_matrices
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Frame, Latent, Video, check_pixels, float32_by_default
+from acwm_core.model.state_stream import StateStream
 from acwm_core.model.stream import Stream, continued
 
 CLIP_FRAMES = 37
@@ -173,6 +174,34 @@ class WorldModel(nn.Module):
             _generators(video, len(actions), seeds),
         )[:, : frames - video.shape[1]]
         return self.named_states(values)
+
+    @float32_by_default()
+    def stream_states(
+        self,
+        given: Frame | Video,
+        actions: Actions | None = None,
+        *,
+        seeds: Sequence[int] | None = None,
+    ) -> StateStream:
+        """Start to predict the states of many scenes step by step, as actions arrive.
+
+        No picture is drawn, so thousands of scenes may be moved at once.
+
+        Args:
+            given: the first frames of each scene, as for `rollout_chunks`.
+            actions: raw actions between them, `[B, K − 1, A]`; none for a single frame.
+            seeds: one per scene; 0, 1, … by default.
+
+        Raises:
+            RecipeError: the model does not carry states.
+        """
+        able = isinstance(self.model, Predictor) and self.model.implements("carry_states")
+        if not able or not self.state_shapes:
+            raise RecipeError(f"{type(self.model).__name__} carries no states from frame to frame")
+        video = self._given(given)
+        if actions is None:
+            actions = video.new_zeros(len(video), 0, len(self.action_low))
+        return StateStream(self, video, actions, _generators(video, len(video), seeds))
 
     def named_states(self, values: Tensor) -> dict[str, Tensor]:
         """States `[B, T, S]` as the fields that they are, `[B, T, …]` by name."""

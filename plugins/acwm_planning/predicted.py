@@ -65,4 +65,9 @@ def predicted_observation(states: Tensor, shapes: Mapping[str, tuple[int, ...]])
         name: np.asarray(part.reshape(-1, *shape))
         for part, (name, shape) in zip(parts, shapes.items(), strict=True)
     }
-    return Observation(cast(Any, _NoMasks(len(states))), PredictedStates(fields))
+    return observation_of(fields, len(states))
+
+
+def observation_of(fields: Mapping[str, NDArray[Any]], frames: int) -> Observation:
+    """What is known of so many frames T from fields of their states alone, `[T, …]` each."""
+    return Observation(cast(Any, _NoMasks(frames)), PredictedStates(fields))

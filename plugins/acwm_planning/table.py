@@ -42,10 +42,10 @@ class EpisodeLine:
     rollouts_per_decision: float | None = None
 
 
-def summarise(lines: Sequence[Line]) -> list[RowSummary]:
-    """Summarise each row that has episodes, in the order of `ROW_NAMES`."""
-    by_row = {row: {n["seed"]: n for n in lines if n["row"] == row} for row in ROW_NAMES}
-    rows = [row for row in ROW_NAMES if by_row[row]]
+def summarise(lines: Sequence[Line], names: Sequence[str] = ROW_NAMES) -> list[RowSummary]:
+    """Summarise each row that has episodes, in the order of these names."""
+    by_row = {row: {n["seed"]: n for n in lines if n["row"] == row} for row in names}
+    rows = [row for row in names if by_row[row]]
     return [_row(row, by_row[row], by_row[rows[0]]) for row in rows]
 
 

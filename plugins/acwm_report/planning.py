@@ -241,8 +241,8 @@ def draw_landscapes(
     default=("scripted",),
     metavar="POLICY",
     help="Policy to rank; repeat for several. scripted (the default) stands for all built-in ones; "
-    "or name one of them, such as solution,skill=0.7,noise=0.3,bias=0.15, or module:name for "
-    "your own.",
+    "or name one of them, such as solution,skill=0.7,noise=0.3,bias=0.15; or, for your own, "
+    "module:name or the folder of a trained one.",
 )
 @click.option("--seeds", default="0..7", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; RUN/ranking/TASK by default.")
@@ -268,7 +268,7 @@ def rank(
     from acwm_planning.policies.scripted import parse_policy
 
     for word in policies:  # reports misspelt names before the slow import of torch
-        if word != "scripted" and ":" not in word:
+        if word != "scripted" and ":" not in word and not Path(word).is_dir():
             parse_policy(word)
 
     from acwm_planning.policies.run import rank_policies

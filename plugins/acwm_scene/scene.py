@@ -14,7 +14,13 @@ from acwm_core.env.card import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.batch import noise_of_clips, to_device
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import Keypoints, LatentStream, ModelInputs, Predictor
+from acwm_core.model.dynamics import (
+    CarriedStates,
+    Keypoints,
+    LatentStream,
+    ModelInputs,
+    Predictor,
+)
 from acwm_core.model.shapes import Latent
 from acwm_scene.bodies import BodyGroup
 from acwm_scene.declared import GroupSpec, default_states, groups_of
@@ -192,11 +198,18 @@ class SceneDynamics(Predictor):
         Returns:
             The scene, and courses `[B, stride, …]`, by group.
         """
-        states, courses = dict[str, Any](), dict[str, Any]()
-        with torch.autocast(scene.base.device.type, enabled=False):
-            for name, group in self._groups():
-                states[name], courses[name] = group.move(scene.states[name], actions[name])
+        states, courses = self.move_states(scene.states, actions)
         return scene._replace(states=states), courses
+
+    def move_states(
+        self, states: Mapping[str, Any], actions: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The states of each group one latent frame later, and their courses; see `move`."""
+        moved, courses = dict[str, Any](), dict[str, Any]()
+        with torch.autocast(next(iter(actions.values())).device.type, enabled=False):
+            for name, group in self._groups():
+                moved[name], courses[name] = group.move(states[name], actions[name])
+        return moved, courses
 
     def draw(self, scene: Scene, shown: Mapping[str, Any]) -> Tensor:
         """The latent frame `[B, C, h, w]` of courses `[B, stride, …]`, the last frame first."""
@@ -247,13 +260,7 @@ class SceneDynamics(Predictor):
             RecipeError: it learnt no states but its points, or the weights do not hold their
                 scale.
         """
-        if not self.state_size:
-            raise RecipeError("this scene knows only points that it found itself, and no states")
-        if not all(group.is_prepared for _, group in self._groups()):
-            raise RecipeError(
-                "these weights do not hold the scale of their states, as an earlier version made "
-                "them, so no states can be predicted: train further by training.init_from"
-            )
+        self._check_states()
         return self.decode(self._foretold(given, conditioning, frames, generators))[:, 1:]
 
     def read_keypoints(self, latents: Latent) -> Keypoints:
@@ -280,6 +287,16 @@ class SceneDynamics(Predictor):
         courses = self._foretold(given, conditioning, frames, generators)
         later = tree_map(lambda values: values[:, self.stride :: self.stride], courses)
         return self._keypoints(later, given.shape[4] / given.shape[3])
+
+    def carry_states(self, given: Latent, generators: Sequence[Generator] = ()) -> CarriedStates:
+        """The states alone, step by step; see `Predictor.carry_states`.
+
+        Raises:
+            RecipeError: as `predict_states`.
+        """
+        self._check_states()
+        scene = self._with_draw(self.read(given), self._drawn(given, generators))
+        return _SceneStates(self, scene.states)
 
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[Generator] = ()
@@ -373,6 +390,11 @@ class SceneDynamics(Predictor):
             for name, group in self._groups()
         }
 
+    def states_of(self, states: Mapping[str, Any]) -> Tensor:
+        """The values `[B, S]` of the states of each group, without points."""
+        frames = {name: stacked([group.frame(states[name])]) for name, group in self._groups()}
+        return self.decode(frames)[:, 0]
+
     def decode(self, courses: Mapping[str, Any]) -> Tensor:
         """The inverse of `encode`, `[B, T, S]`, without points."""
         parts = {name: group.decode(courses[name]) for name, group in self._groups()}
@@ -451,6 +473,16 @@ class SceneDynamics(Predictor):
 
     def _groups(self) -> list[tuple[str, Group]]:
         return cast(list[tuple[str, Group]], [*self.groups.named_children()])
+
+    def _check_states(self) -> None:
+        """Refuse to tell states that it does not know."""
+        if not self.state_size:
+            raise RecipeError("this scene knows only points that it found itself, and no states")
+        if not all(group.is_prepared for _, group in self._groups()):
+            raise RecipeError(
+                "these weights do not hold the scale of their states, as an earlier version made "
+                "them, so no states can be predicted: train further by training.init_from"
+            )
 
     def _predicted(
         self,
@@ -563,3 +595,31 @@ class _SceneStream(LatentStream):
         """The next latent frame; see `LatentStream.advance`."""
         latent, self._scene = self._model.next_frame(self._scene, conditioning)
         return latent
+
+
+class _SceneStates(CarriedStates):
+    """The states of scenes, without what drawing them needs."""
+
+    def __init__(self, model: SceneDynamics, states: dict[str, Any]) -> None:
+        self._model, self._states = model, states
+
+    @property
+    def current(self) -> Tensor:
+        return self._model.states_of(self._states)
+
+    def advance(self, conditioning: Conditioning) -> Tensor:
+        actions = {name: rows[:, -1] for name, rows in self._model.embed(conditioning).items()}
+        self._states, courses = self._model.move_states(self._states, actions)
+        return self._model.decode(courses)
+
+    def picked(self, rows: Tensor) -> CarriedStates:
+        copied = tree_map(lambda values: values[rows.to(values.device)].clone(), self._states)
+        return _SceneStates(self._model, copied)
+
+    def put(self, rows: Tensor, others: CarriedStates) -> None:
+        assert isinstance(others, _SceneStates)
+        self._states = tree_map(
+            lambda own, new: own.index_copy(0, rows.to(own.device), new.to(own)),
+            self._states,
+            others._states,
+        )

@@ -13,7 +13,7 @@ from acwm_core.checks.model import DenoiserChecks, DynamicsChecks, Probe
 from acwm_core.checks.result import checks_of
 from acwm_core.checks.trial import TinyDrawer, TinyPredictor
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import DynamicsModel, Predictor
+from acwm_core.model.dynamics import CarriedStates, DynamicsModel, Predictor
 from acwm_core.model.objectives.next_frame import NextFrame
 from acwm_dit.dit import DiT
 from acwm_scene.recurrent import RecurrentModel
@@ -405,3 +405,54 @@ class LeavesOutAFrame(Scene):
 class Diverges(Scene):
     def predict_states(self, given, conditioning, frames, generators=()):
         return super().predict_states(given, conditioning, frames, generators) / 0
+
+
+class Carried(CarriedStates):
+    """Passes on to the states of a scene, to spoil."""
+
+    def __init__(self, states):
+        self._states = states
+
+    @property
+    def current(self):
+        return self._states.current
+
+    def advance(self, conditioning):
+        return self._states.advance(conditioning)
+
+    def picked(self, rows):
+        return type(self)(self._states.picked(rows))
+
+    def put(self, rows, others):
+        self._states.put(rows, others._states)
+
+
+@FLAWS.caught_by("carries the states that it predicts", "the carried states differ by")
+class Shifts(Scene):
+    class Kept(Carried):
+        def advance(self, conditioning):
+            return super().advance(conditioning) + 1
+
+    def carry_states(self, given, generators=()):
+        return self.Kept(super().carry_states(given, generators))
+
+
+@FLAWS.caught_by("carries the states that it predicts", "not the last of the states")
+class StaysBehind(Scene):
+    class Kept(Carried):
+        @property
+        def current(self):
+            return super().current + 1
+
+    def carry_states(self, given, generators=()):
+        return self.Kept(super().carry_states(given, generators))
+
+
+@FLAWS.caught_by("carries the states that it predicts", "begins anew differ by")
+class NeverBeginsAnew(Scene):
+    class Kept(Carried):
+        def put(self, rows, others):
+            pass
+
+    def carry_states(self, given, generators=()):
+        return self.Kept(super().carry_states(given, generators))

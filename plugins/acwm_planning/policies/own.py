@@ -18,12 +18,15 @@ from acwm_core.evaluation.clips import as_clip
 from acwm_core.recipe.trust import import_named
 from acwm_planning.controllers import Actions, Controller
 from acwm_planning.futures import History
+from acwm_planning.policies.saved import is_policy, policy_for
 
 
 class OwnPolicy:
-    """A user's policy, named by ``module:name`` and asked for an action once per latent frame.
+    """A user's policy, asked for an action once per latent frame.
 
-    It is one of the following, or a class that creates one when called without arguments:
+    It is named by the folder of a policy that `acwm policy train` has trained, or by
+    ``module:name``, which is one of the following, or a class that creates one when called without
+    arguments:
 
     * a torch module: takes a frame ``[1, 3, H, W]`` in [0, 1] and returns ``[1, A]``;
     * an object with `predict`, as in stable-baselines3: takes ``[H, W, 3]`` uint8 and returns an
@@ -35,7 +38,7 @@ class OwnPolicy:
     an episode starts.
 
     Args:
-        name: ``module:name`` of the policy.
+        name: ``module:name`` of the policy, or its folder.
         card: card of the environment.
 
     Raises:
@@ -44,7 +47,8 @@ class OwnPolicy:
 
     def __init__(self, name: str, card: EnvironmentCard) -> None:
         self.name, self._card = name, card
-        policy = import_named(name, f"the policy {name}")
+        policy: Any = policy_for(name, card) if is_policy(name) else None
+        policy = import_named(name, f"the policy {name}") if policy is None else policy
         if isinstance(policy, type):
             policy = self._call("made", policy)
         if not (callable(getattr(policy, "predict", None)) or callable(policy)):

@@ -31,6 +31,7 @@ from acwm_planning.policies.episode import Outcome, read_outcome, true_outcome
 from acwm_planning.policies.judges import EpisodeSimulator, ModelJudge
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.ranking import RANKING_FILE, Ranking
+from acwm_planning.policies.saved import is_policy, policy_for
 from acwm_planning.policies.scripted import (
     ScriptedPolicy,
     built_in_policies,
@@ -187,7 +188,8 @@ def rank_policies(
     Args:
         run: the run folder, or the name of a trained model.
         task: name of a task of its environment.
-        policies: `SCRIPTED`, names of scripted policies, or ``module:name`` of a user's own.
+        policies: `SCRIPTED`, names of scripted policies, or ``module:name`` or the folder of a
+            user's own.
         seeds: numbers of the episodes, the same for all policies.
         out: the results folder.
         steps: sampling steps of the model; its own number by default.
@@ -244,7 +246,9 @@ def _parse_policies(
     for word in words:
         if word == SCRIPTED:
             parsed |= {policy.name: policy for policy in built_in_policies(solved)}
-        elif ":" in word:
+        elif ":" in word or is_policy(word):
+            if is_policy(word):
+                policy_for(word, card, task.name)
             parsed[word] = OwnPolicy(word, card)
         else:
             policy = parse_policy(word)

@@ -1,0 +1,248 @@
+"""`SavedPolicy`: a policy in a file that holds weights and plain values, and runs no code."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.task import Goal
+from acwm_core.errors import DataError, RecipeError
+from acwm_core.files import check_fetched, parse_json, typed, written_whole
+
+POLICY_FILE = "policy.safetensors"
+"""The file in a policy's folder."""
+
+FURTHEST = 10.0
+"""Scaled observations are limited to ± this number, so that no outlier upsets a network."""
+
+ACTIVATIONS: Mapping[str, type[nn.Module]] = {
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "hardtanh": nn.Hardtanh,
+}
+"""What may stand between linear layers, by its name in the file."""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PolicyInputs:
+    """What a policy observes, as one vector.
+
+    The state now, its change since the decision before, and the goal: fields side by side, scaled.
+    What is unknown is taken as the mean.
+
+    Attributes:
+        state: shapes of the fields of the state, by name.
+        goal: shapes of the fields of the goal's state.
+        mean: of the fields of the state and of the goal, `[S + G]`.
+        std: their standard deviations.
+        change: standard deviation of the changes of the state, `[S]`.
+    """
+
+    state: dict[str, list[int]]
+    goal: dict[str, list[int]]
+    mean: list[float]
+    std: list[float]
+    change: list[float]
+
+    @property
+    def size(self) -> int:
+        """Number of values of the vector."""
+        return len(self.mean) + len(self.change)
+
+    def vectors(self, now: Values, before: Values, goals: Values) -> NDArray[np.float32]:
+        """The vectors `[N, size]` of states `[N, S]`, earlier ones, and goals `[N, G]`."""
+        mean, std, change = (np.array(each) for each in (self.mean, self.std, self.change))
+        values = np.concatenate([now, goals], 1)
+        parts = [(values - mean) / std, (now - before) / change]
+        whole = np.nan_to_num(np.concatenate(parts, 1), nan=0.0, posinf=FURTHEST, neginf=-FURTHEST)
+        return whole.clip(-FURTHEST, FURTHEST).astype(np.float32)
+
+
+def side_by_side(fields: Mapping[str, Any], shapes: Mapping[str, Sequence[int]]) -> Values:
+    """The values of some fields `[N, …]` side by side, `[N, S]`."""
+    parts = [
+        np.asarray(fields[name], np.float64).reshape(-1, math.prod(shape))
+        for name, shape in shapes.items()
+    ]
+    return np.concatenate(parts, 1)
+
+
+@dataclass(frozen=True)
+class PolicyCard:
+    """What a saved policy is for, and how it was trained.
+
+    Attributes:
+        environment: name of the environment.
+        task: name of the task.
+        repeat: number of actions for which each of its actions is held.
+        low: lower bounds of the actions, `[A]`.
+        high: upper bounds, `[A]`.
+        inputs: what it observes.
+        layers: the network: numbers of linear layers among names of `ACTIVATIONS`.
+        training: how it was trained, for people.
+    """
+
+    environment: str
+    task: str
+    repeat: int
+    low: list[float]
+    high: list[float]
+    inputs: PolicyInputs
+    layers: list[int | str]
+    training: dict[str, Any]
+
+
+class SavedPolicy:
+    """A policy as `acwm policy train` leaves it: an object of the kind that `OwnPolicy` takes.
+
+    Args:
+        card: what it is for.
+        network: maps vectors `[N, O]` to actions `[N, A]`, scaled to [-1, 1].
+    """
+
+    observes = "state"
+
+    def __init__(self, card: PolicyCard, network: nn.Module) -> None:
+        self.card, self._network = card, network.eval()
+        self._low, self._high = np.array(card.low), np.array(card.high)
+        self._before: Values | None = None
+        self._goal: Values | None = None
+
+    def actions(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Raw actions `[N, A]` for vectors of observations `[N, O]`."""
+        return raw_actions(self.scaled(vectors), self._low, self._high)
+
+    def scaled(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Actions scaled to [-1, 1], `[N, A]`, for vectors of observations `[N, O]`."""
+        with torch.no_grad():
+            return self._network(torch.from_numpy(vectors)).numpy()
+
+    def reset(self, goal: Goal) -> None:
+        """Start an episode."""
+        fields = {name: np.asarray(goal.state[name])[None] for name in self.card.inputs.goal}
+        self._goal, self._before = side_by_side(fields, self.card.inputs.goal), None
+
+    def predict(self, state: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """The next raw action `[A]`; what is unknown is taken to be as it was.
+
+        Raises:
+            RecipeError: a field that the policy observes is missing, or no goal was given.
+        """
+        shapes = self.card.inputs.state
+        if missing := [name for name in shapes if name not in state]:
+            raise RecipeError(
+                f"the policy observes {', '.join(missing)}, which nothing here reads: train one "
+                f"with observe=[{', '.join(name for name in shapes if name in state)}]"
+            )
+        if self._goal is None:
+            raise RecipeError("a policy needs its goal: call reset(goal) first")
+        now = side_by_side({name: np.asarray(state[name])[None] for name in shapes}, shapes)
+        before = now if self._before is None else self._before
+        now = np.where(np.isfinite(now), now, before)
+        self._before = now
+        return self.actions(self.card.inputs.vectors(now, before, self._goal))[0]
+
+    def save(self, folder: Path) -> None:
+        """Write the policy's file into a folder."""
+        weights = {name: value.contiguous() for name, value in self._network.state_dict().items()}
+        details = {"policy": json.dumps(asdict(self.card))}
+        with written_whole(folder / POLICY_FILE) as partial:
+            partial.write_bytes(safetensors.torch.save(weights, details))
+
+    @classmethod
+    def read(cls, folder: Path) -> SavedPolicy:
+        """The policy of a folder.
+
+        Raises:
+            DataError: there is none, or the file is damaged or of another version.
+        """
+        path = folder / POLICY_FILE
+        if not path.is_file():
+            raise DataError(f"{folder} holds no policy: train one with `acwm policy train`")
+        check_fetched(path)
+        try:
+            with safetensors.safe_open(path, "pt") as file:
+                about: Any = (file.metadata() or {}).get("policy", "null")
+                weights: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            card: PolicyCard = typed(parse_json(about), PolicyCard)
+            network = network_of(card.layers, weights)
+            _check_sizes(card, network)
+        except (ValueError, RuntimeError, KeyError, safetensors.SafetensorError) as error:
+            raise DataError(f"{path} is no policy of this version of acwm ({error})") from error
+        return cls(card, network)
+
+
+def raw_actions(scaled: NDArray[Any], low: Values, high: Values) -> NDArray[np.float32]:
+    """Actions scaled to [-1, 1], `[…, A]`, in the units of the environment, within its bounds."""
+    raw = low + (np.asarray(scaled, np.float64).clip(-1, 1) + 1) / 2 * (high - low)
+    bounds = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    return np.clip(raw.astype(np.float32), *bounds)
+
+
+def network_of(layers: Sequence[int | str], weights: Mapping[str, Tensor]) -> nn.Sequential:
+    """The network of these layers; `ValueError` for one that does not exist."""
+    modules: list[nn.Module] = []
+    for place, layer in enumerate(layers):
+        if isinstance(layer, str):
+            if layer not in ACTIVATIONS:
+                raise ValueError(f"there is no layer {layer!r}")
+            modules.append(ACTIVATIONS[layer]())
+        else:
+            matrix = weights[f"{place}.weight"]
+            modules.append(nn.Linear(matrix.shape[1], matrix.shape[0]))
+    network = nn.Sequential(*modules)
+    network.load_state_dict(dict(weights))
+    return network
+
+
+def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
+    """Refuse a network that does not fit what it observes or moves, by `ValueError`."""
+    inputs = card.inputs
+    state, goal = (sum(map(math.prod, each.values())) for each in (inputs.state, inputs.goal))
+    sizes = len(inputs.mean), len(inputs.std), len(inputs.change)
+    linear = [each for each in network if isinstance(each, nn.Linear)]
+    ends = (linear[0].in_features, linear[-1].out_features) if linear else (0, 0)
+    if sizes != (state + goal, state + goal, state) or ends != (inputs.size, len(card.low)):
+        raise ValueError("its sizes do not fit each other")
+    if len(card.low) != len(card.high) or card.repeat < 1:
+        raise ValueError("its actions have no bounds")
+
+
+def is_policy(name: str) -> bool:
+    """Whether this is the folder of a saved policy."""
+    return (Path(name) / POLICY_FILE).is_file()
+
+
+def policy_for(name: str, card: EnvironmentCard, task: str | None = None) -> SavedPolicy:
+    """The policy of a folder, for the environment and the task that it was trained for.
+
+    Args:
+        name: the folder.
+        card: card of the environment.
+        task: name of the task; any if None.
+
+    Raises:
+        RecipeError: it was trained for another environment or task.
+    """
+    policy = SavedPolicy.read(Path(name))
+    wanted = card.name, policy.card.task if task is None else task
+    if (policy.card.environment, policy.card.task) != wanted:
+        raise RecipeError(
+            f"the policy {name} was trained for {policy.card.environment}.{policy.card.task}, not "
+            f"for {'.'.join(wanted)}"
+        )
+    return policy

@@ -1,0 +1,148 @@
+"""`acwm policy train` and `acwm policy evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from acwm_core.cli.arguments import DATASET, OUT_FOLDER, ExistingFolder, seeds_of
+
+POLICY = ExistingFolder(
+    "policy's folder", "policy.safetensors", "`acwm policy train ENVIRONMENT.TASK`"
+)
+
+NAMES = {
+    "trained": "trained policy",
+    "dream": "the same, in the dream",
+    "solution": "script that knows the goal",
+    "random": "random actions",
+    "still": "no motion",
+}
+"""What the rows of the table are called."""
+
+
+@click.group()
+def policy() -> None:
+    """Train a policy in a model, and evaluate it in the simulator."""
+
+
+@policy.command()
+@click.argument("task", metavar="ENVIRONMENT.TASK")
+@click.argument("words", nargs=-1, metavar="[MODEL] [OVERRIDES]...")
+@click.option(
+    "--in",
+    "place",
+    type=click.Choice(["dream", "simulator"]),
+    default="dream",
+    help="Where the policy acts while it learns: in the model, or in the simulator.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    default=200_000,
+    help="Steps of all scenes together; an action is held for a step, which is a latent frame.",
+)
+@click.option(
+    "--scenes",
+    type=click.IntRange(1),
+    help="Scenes side by side; by default 64 in the dream, 1 in the simulator.",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(1),
+    default=256,
+    help="Training episodes whose first frames and goals are used.",
+)
+@click.option(
+    "--data", type=DATASET, help="Dataset to take them from; by default the simulator draws them."
+)
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the training.")
+@click.option(
+    "--out", type=OUT_FOLDER, help="The policy's folder; runs/policies/ENVIRONMENT.TASK by default."
+)
+@click.option("--device", default="auto", help="Device of the model.")
+def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **options: Any) -> None:
+    """Train a policy at a task by acting in a model of its environment.
+
+    MODEL is a run folder or a trained model; the trained model of the environment by default. It
+    must predict states. OVERRIDES choose what learns, and set its parameters by name:
+    algorithm=sac (or ppo, td3) learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
+    (fields of the state) and bonus=1 (reward for success). If it is interrupted, run the same
+    command again to continue; with more --steps it trains on.
+    """
+    from acwm_policy.settings import settings_of
+
+    environment = task.rpartition(".")[0]
+    if not environment:
+        raise click.BadParameter(f"{task}: give ENVIRONMENT.TASK, such as reacher.reach")
+    models = [word for word in words if "=" not in word]
+    if len(models) > 1:
+        raise click.BadParameter(f"give one model, not {', '.join(models)}")
+    settings = settings_of([word for word in words if "=" in word])
+
+    from acwm_policy.train import train_policy
+
+    where = out or Path("runs/policies") / task
+    model = models[0] if models else environment
+    trained = train_policy(
+        model, task, settings=settings, out=where, place=place, progress=True, **options
+    )
+    facts = trained.card.training
+    click.echo(f"{where}: {facts['steps']} steps in {facts['cpu_seconds']:.0f} s of processor time")
+    click.echo(f"next: acwm policy evaluate {where}")
+
+
+@policy.command()
+@click.argument("folder", type=POLICY, metavar="POLICY")
+@click.option("--seeds", default="0..19", callback=seeds_of, help="Episodes: 0,1,2 or 0..49.")
+@click.option(
+    "--run", metavar="MODEL", help="Model to dream in; by default the one it was trained with."
+)
+@click.option("--out", type=OUT_FOLDER, help="Folder of the results; POLICY/evaluation by default.")
+@click.option("--device", default="auto", help="Device of the model.")
+def evaluate(folder: Path, **options: Any) -> None:
+    """Measure how often a trained policy succeeds in the simulator.
+
+    All rows begin at the same starts, of the test split: the policy, random actions, no motion, and
+    the script that knows the goal if the task has one; and the policy in the model. How much better
+    it is there is the gap: what it gains from errors of the model. The policy observes the states
+    of the simulator. If it is interrupted, run the same command again to continue.
+    """
+    from acwm_policy.evaluate import evaluate_policy
+
+    found = evaluate_policy(folder, progress=True, **options)
+    print_evaluation(found)
+    click.echo(options["out"] or folder / "evaluation")
+
+
+def print_evaluation(found: dict[str, Any]) -> None:
+    """Print the table of `evaluate_policy`."""
+    from rich.console import Console
+
+    from acwm_core.cli.tables import print_table
+
+    def share(row: dict[str, Any]) -> str:
+        estimate = row["success"]
+        low, high = estimate["low"], estimate["high"]
+        return f"{estimate['value']:.0%} [{low:.0%}, {high:.0%}]"
+
+    rows = [
+        (
+            NAMES[row["row"]],
+            [
+                f"{row['successes']}/{row['episodes']}",
+                share(row),
+                f"{row['distance']['value']:.3g} {found['unit']}".strip(),
+                "" if row["p"] is None else f"{row['p']:.2g}",
+            ],
+        )
+        for row in found["rows"]
+    ]
+    title = f"{found['environment']}.{found['task']}"
+    headings = ("solved", "share, 95 %", "final distance", "p")
+    print_table(Console(highlight=False, markup=False), title, headings, rows)
+    gap = found["gap"]
+    about = "" if gap["low"] is None else f" [{gap['low']:+.0%}, {gap['high']:+.0%}]"
+    click.echo(f"gap (dream − simulator): {gap['mean']:+.0%}{about}")

@@ -1,0 +1,229 @@
+"""`evaluate_policy`: a trained policy in the simulator and in its dream, from the same starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from acwm_core.data.shards import file_sha256
+from acwm_core.data.simulate import make_environment
+from acwm_core.env.environment import Environment
+from acwm_core.env.task import Goal, Task, TaskEnvironment
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.evaluate import choose_device
+from acwm_core.evaluation.results import write_json
+from acwm_core.evaluation.statistics import PairedDifference, paired_bootstrap
+from acwm_core.training.run import RunBundle, load_run
+from acwm_core.training.run_folder import RunFolder, find_run
+from acwm_core.training.threads import use_threads
+from acwm_dream.starts import DreamStart
+from acwm_planning.controllers import (
+    Actions,
+    Controller,
+    PolicyController,
+    RandomController,
+    StillController,
+)
+from acwm_planning.episode import load_task, play, spec_of_seed, start_of
+from acwm_planning.futures import History
+from acwm_planning.left_out import LeftOut
+from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy
+from acwm_planning.resumable import Line, ResumableResults
+from acwm_planning.runner import EpisodeTable, play_missing
+from acwm_planning.table import EpisodeLine, summarise
+from acwm_policy.scenes import DreamScenes
+from acwm_policy.vector import TaskScenes
+
+EVALUATION, EVALUATION_FILE = "evaluation", "evaluation.json"
+"""Folder of the results within a policy's folder, and the file with the summary."""
+
+TRAINED, DREAM = "trained", "dream"
+"""Rows of the policy in the simulator, and in the model."""
+
+ROWS = (TRAINED, DREAM, "solution", "random", "still")
+"""Rows of the table, the first one first."""
+
+
+class StateController(Controller):
+    """Lets a saved policy act on the simulator's own states.
+
+    Args:
+        policy: the policy.
+    """
+
+    def __init__(self, policy: SavedPolicy) -> None:
+        self._policy = policy
+
+    def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
+        """Start an episode."""
+        self._environment = environment
+        self._policy.reset(goal)
+
+    def act(self, history: History) -> Actions:
+        """The policy's action, held for a latent frame."""
+        action = self._policy.predict(self._environment.observe_state())
+        return [action] * self._policy.card.repeat
+
+
+class EvaluatedEpisodes(EpisodeTable):
+    """Episodes of a policy and of what it is compared with, from the same starts.
+
+    Args:
+        policy: the policy.
+        bundle: the model that it is dreamt in, on its device.
+        environment: the simulator with the task.
+        rows: of `ROWS`.
+    """
+
+    def __init__(
+        self,
+        policy: SavedPolicy,
+        bundle: RunBundle,
+        environment: TaskEnvironment,
+        rows: Sequence[str],
+    ) -> None:
+        super().__init__(rows)
+        self._policy, self._bundle, self._environment = policy, bundle, environment
+        repeat = policy.card.repeat
+        self._controllers = {
+            TRAINED: StateController(policy),
+            "solution": PolicyController.scripted(solves=True),
+            "random": RandomController(repeat),
+            "still": StillController(),
+        }
+
+    def estimate(self, missing: Mapping[int, Sequence[str]]) -> str:
+        """Episodes are short, so nothing is said of their time."""
+        return ""
+
+    def lines(self, seed: int, rows: Sequence[str]) -> list[Line]:
+        """The episodes of a seed."""
+        lines: list[Line] = []
+        for row in rows:
+            if row in self.left.rows or seed in self.left.solved:
+                continue
+            with self.left.trying(row, seed):
+                lines.append({"row": row, "seed": seed, **self._facts(row, seed)})
+        return lines
+
+    def _facts(self, row: str, seed: int) -> dict[str, Any]:
+        spec = spec_of_seed(self._bundle.card, seed)
+        if row != DREAM:
+            return play(self._environment, spec, self._controllers[row]).facts()
+        given = self._bundle.world_model.context_frames
+        start = start_of(self._environment, spec, given=given)
+        actions = np.array(start.history.actions, np.float32)
+        actions = actions.reshape(given - 1, self._bundle.card.action.size)
+        frames = np.stack(start.history.frames)
+        return dream(
+            self._policy,
+            self._bundle,
+            self._environment.task,
+            DreamStart(frames, actions, start.goal),
+        )
+
+
+def dream(policy: SavedPolicy, bundle: RunBundle, task: Task, start: DreamStart) -> dict[str, Any]:
+    """The facts of an episode of the policy in the model, as those of one in the simulator."""
+    scenes = DreamScenes(bundle.world_model, [start], 1)
+    vector = TaskScenes(scenes, task, bundle.card, policy.card.inputs, unit=1.0, bonus=0.0)
+    vectors, total, begun = vector.begin([0]), 0.0, vector.distances[0]
+    for _ in range(-(-task.max_steps // scenes.repeat)):
+        vector.step_async(policy.scaled(vectors))
+        vectors, rewards, over, infos = vector.step_wait()
+        total += float(rewards[0])
+        if over[0]:
+            facts = infos[0]
+            return {
+                "success": bool(facts["is_success"]),
+                "failed": bool(facts["failed"]),
+                "steps": int(facts["episode"]["l"]),
+                "start_distance": float(begun),
+                "distance": float(begun - total),
+            }
+    raise RecipeError(f"the task {task.name!r} does not end")
+
+
+def evaluate_policy(
+    folder: Path,
+    *,
+    seeds: Sequence[int],
+    run: str | Path | None = None,
+    out: Path | None = None,
+    device: str = "auto",
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Play what is missing, and write the table of all episodes.
+
+    Args:
+        folder: the policy's folder.
+        seeds: numbers of episodes of the test split, the same for all rows.
+        run: the model to dream in; by default the one that the policy was trained with.
+        out: folder of the results; `EVALUATION` within `folder` by default.
+        device: device of the model.
+        progress: show a progress bar.
+
+    Returns:
+        What it writes into `EVALUATION_FILE`.
+
+    Raises:
+        DataError: there is no policy, or no model; or `out` holds results of another policy.
+    """
+    policy, where = SavedPolicy.read(folder), out or folder / EVALUATION
+    use_threads(None, None, choose=True)
+    model = run or policy.card.training.get("model", policy.card.environment)
+    bundle = load_run(model)
+    if bundle.card.name != policy.card.environment:
+        raise RecipeError(
+            f"the policy acts in {policy.card.environment}, but {model} is a model of "
+            f"{bundle.card.name}"
+        )
+    bundle.world_model.to(choose_device(device))
+    task = load_task(bundle.card.name, policy.card.task)
+    identity = {
+        "environment": bundle.card.name,
+        "task": task.name,
+        "policy": file_sha256(folder / POLICY_FILE),
+        "weights": file_sha256(RunFolder(find_run(model)).weights),
+    }
+    inner = make_environment(bundle.card.name, {"size": bundle.card.frame_size})
+    with closing(inner):
+        environment = TaskEnvironment(inner, task)
+        table = EvaluatedEpisodes(policy, bundle, environment, ROWS)
+        results = ResumableResults(where, identity, kind=EpisodeLine)
+        with results.adding():
+            label = f"evaluating at {task.name}" if progress else ""
+            play_missing(table, results, seeds, progress=label)
+            found = _summary(results, task, policy, table.left)
+            write_json(where / EVALUATION_FILE, found)
+    return found
+
+
+def _summary(
+    results: ResumableResults,
+    task: Task,
+    policy: SavedPolicy,
+    left: LeftOut,
+) -> dict[str, Any]:
+    lines = results.finished()
+    return {
+        **results.settings,
+        "unit": task.unit,
+        "tolerance": task.tolerance,
+        **left.facts(),
+        "rows": [asdict(row) for row in summarise(lines, ROWS)],
+        "gap": asdict(gap_of(lines)),
+        "training": policy.card.training,
+    }
+
+
+def gap_of(lines: Sequence[Line]) -> PairedDifference:
+    """By how much success in the dream exceeds that in the simulator, on the episodes of both."""
+    won = {(line["row"], line["seed"]): float(line["success"]) for line in lines}
+    seeds = [seed for row, seed in won if row == TRAINED and (DREAM, seed) in won]
+    return paired_bootstrap([won[DREAM, seed] - won[TRAINED, seed] for seed in seeds] or [0.0])

@@ -1,0 +1,105 @@
+"""What a task looks at, and how it judges the steps of scenes by their states alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.env.task import Goal, Task, judged
+from acwm_core.errors import RecipeError
+from acwm_planning.predicted import NotPredicted, observation_of
+from acwm_policy.scenes import States
+
+
+class Watched(Mapping[str, Any]):
+    """Fields that remember which of them were asked for (`asked`)."""
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self._fields, self.asked = fields, dict[str, None]()
+
+    def __getitem__(self, name: str) -> Any:
+        value = self._fields[name]
+        self.asked[name] = None
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+
+class Needs(NamedTuple):
+    """What a task looks at."""
+
+    state: list[str]
+    goal: list[str]
+
+
+def needs_of(task: Task, states: States, goal: Goal) -> Needs:
+    """The fields of the state and of the goal that a task looks at, to judge a scene.
+
+    Args:
+        task: the task.
+        states: of one scene, `[T, …]`.
+        goal: its goal.
+
+    Raises:
+        RecipeError: the task looks at something that is not in the states.
+    """
+    frames = len(next(iter(states.values())))
+    seen, aim = Watched(states), Watched(goal.state)
+    watched = Goal(aim, goal.mask, goal.frame)
+    try:
+        for method in ("distance", "success", "failed"):
+            judged(task, method, observation_of(seen, frames), watched)
+    except (NotPredicted, KeyError) as error:
+        raise RecipeError(
+            f"the model predicts {', '.join(states)}, and the task {task.name!r} looks at more "
+            f"than that, so no policy can be trained in it ({str(error).strip(chr(39))})"
+        ) from error
+    return Needs([*seen.asked], [*aim.asked])
+
+
+class Judgement(NamedTuple):
+    """How a step of n scenes went."""
+
+    distance: NDArray[np.float64]  # `[n]`, in the last frame that counts; the one before if unknown
+    success: NDArray[np.bool_]
+    failed: NDArray[np.bool_]  # in this step or before
+
+
+def judge(
+    task: Task,
+    states: States,
+    goals: Sequence[Goal],
+    before: NDArray[np.float64],
+    failed: NDArray[np.bool_],
+    frames: NDArray[np.int64],
+) -> Judgement:
+    """Judge the video frames of a step, each scene by the task and its own goal.
+
+    Args:
+        task: the task.
+        states: of n scenes in the frames of the step, `[n, T, …]`.
+        goals: of the scenes.
+        before: their distances before the step, `[n]`.
+        failed: which have failed before the step, `[n]`.
+        frames: for each scene, how many of the frames lie within the task's time, at least 1.
+    """
+    distance, success, after = before.copy(), np.zeros(len(goals), np.bool_), failed.copy()
+    for row, goal in enumerate(goals):
+        count = int(frames[row])
+        seen = observation_of({name: v[row, :count] for name, v in states.items()}, count)
+        distances, solved, failures = (
+            judged(task, method, seen, goal) for method in ("distance", "success", "failed")
+        )
+        after[row] = failed[row] or bool(failures.any())
+        success[row] = bool(solved.any()) and not failed[row]
+        last = int(solved.argmax()) + 1 if success[row] else count
+        known = distances[:last][np.isfinite(distances[:last])]
+        distance[row] = known[-1] if len(known) else before[row]
+    return Judgement(distance, success, after)

@@ -1,0 +1,263 @@
+"""What a policy learns from: a task, starts, scenes, and the scale of what it observes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acwm_core.data.dataset import EpisodeDataset
+from acwm_core.env.environment import EnvironmentCard
+from acwm_core.env.episode import EpisodeSpec, Split
+from acwm_core.env.task import Goal, SolvedAtStartError, Task
+from acwm_core.errors import AcwmWarning, DataError, RecipeError, suggest
+from acwm_core.evaluation.score import estimator_for
+from acwm_core.model.world_model import WorldModel
+from acwm_core.plugins import catalog
+from acwm_core.training.run import RunBundle
+from acwm_dream.starts import DatasetStarts, DreamStart, SimulatorStarts
+from acwm_planning.episode import load_task
+from acwm_planning.policies.saved import PolicyInputs, side_by_side
+from acwm_policy.judging import judge, needs_of
+from acwm_policy.scenes import DreamScenes, Scenes, SimulatorScenes, States
+
+Place = Literal["dream", "simulator"]
+"""Where a policy acts."""
+
+MEASURED = 256
+"""Fewest random steps from which the scale of observations is measured."""
+
+
+class Lesson(NamedTuple):
+    """What a policy learns from.
+
+    Attributes:
+        card: card of the environment.
+        task: the task.
+        scenes: where it acts.
+        inputs: what it observes.
+        unit: mean distance of the starts, which is worth a reward of 1.
+    """
+
+    card: EnvironmentCard
+    task: Task
+    scenes: Scenes
+    inputs: PolicyInputs
+    unit: float
+
+
+class Beginnings(NamedTuple):
+    """Starts, and the specs of their episodes in the simulator, if they are of it."""
+
+    starts: list[DreamStart]
+    specs: list[EpisodeSpec]
+
+
+def find_task(name: str, card: EnvironmentCard) -> Task:
+    """The task ``ENVIRONMENT.TASK`` or ``TASK`` of a model's environment.
+
+    Raises:
+        RecipeError: it is a task of another environment, or there is no such task.
+    """
+    environment, _, task = name.rpartition(".")
+    if environment and environment != card.name:
+        raise RecipeError(f"{name} is a task of {environment}, but the model is of {card.name}")
+    return load_task(card.name, task)
+
+
+def begin_episodes(
+    card: EnvironmentCard, given: int, task: Task, count: int, split: Split = "train"
+) -> Beginnings:
+    """The starts of the first episodes of a split, as the simulator shows them, with goals.
+
+    Args:
+        card: card of the environment, with the frame size.
+        given: number of context frames.
+        task: draws the goals.
+        count: number of starts; episodes that are solved at their start are passed over.
+        split: of the episodes.
+    """
+    found, number = Beginnings([], []), 0
+    with closing(SimulatorStarts(card, given, task)) as simulator:
+        rng = np.random.default_rng(0)  # unused, as the episode is given
+        while len(found.starts) < count:
+            spec = EpisodeSpec(card.name, split, number, options={"size": card.frame_size})
+            number += 1
+            try:
+                found.starts.append(simulator.draw(rng, {"spec": spec}))
+            except SolvedAtStartError:
+                if number > 10 * count:
+                    raise
+                continue
+            found.specs.append(spec)
+    return found
+
+
+def recorded_starts(folder: str | Path, given: int, count: int) -> Beginnings:
+    """The first frames of the first training episodes of a dataset; goals are their last frames."""
+    episodes = EpisodeDataset(Path(folder), "train")
+    starts, rng = DatasetStarts(episodes, given), np.random.default_rng(0)
+    numbers = range(min(count, len(episodes)))
+    return Beginnings([starts.draw(rng, {"episode": number}) for number in numbers], [])
+
+
+def beginnings(
+    bundle: RunBundle, task: Task, count: int, data: str | Path | None, place: Place
+) -> Beginnings:
+    """The starts of training: the simulator's, or those of a dataset.
+
+    Raises:
+        DataError: there is neither.
+    """
+    card, given = bundle.card, bundle.world_model.context_frames
+    simulated = card.name in catalog().registry("environment")
+    if data is not None and place == "simulator":
+        raise RecipeError("--data is for the dream: the simulator begins with its own episodes")
+    if data is None and simulated:
+        return begin_episodes(card, given, task, count)
+    if data is None:
+        text = f"{card.name} has no simulator here: episodes begin like those of its data"
+        warnings.warn(text, AcwmWarning, stacklevel=2)
+    folder = data or bundle.recipe.data.get("path")
+    if folder is None:
+        raise DataError("there is no dataset to start from: name one with --data")
+    return recorded_starts(folder, given, count)
+
+
+def prepare(
+    bundle: RunBundle,
+    task: Task,
+    begun: Beginnings,
+    place: Place,
+    number: int,
+    observe: Sequence[str] | None = None,
+    seed: int = 0,
+) -> Lesson:
+    """The scenes of a task, and what a policy observes in them.
+
+    Args:
+        bundle: the loaded run.
+        task: the task.
+        begun: the starts.
+        place: in the dream of the model, or in the simulator.
+        number: number of scenes.
+        observe: names of the fields of the state to observe; see `PolicySettings`.
+        seed: of the random steps that measure the scale of observations.
+    """
+    card, world = bundle.card, bundle.world_model
+    shapes = {name: [*shape] for name, shape in world.state_shapes.items()}
+    goals = [start.goal for start in begun.starts if start.goal is not None]
+    if place == "dream":
+        scenes: Scenes = DreamScenes(world, begun.starts, number)
+    else:
+        repeat = world.codec.temporal_stride
+        scenes = SimulatorScenes(card, begun.specs, goals, repeat, number)
+    if not shapes:
+        raise RecipeError(f"{type(world.model).__name__} learns no states, so none can be observed")
+    first, _ = scenes.begin([0], [0])
+    needs = needs_of(task, {name: first[name] for name in shapes}, goals[0])
+    chosen = chosen_fields(world, card, needs.state, observe)
+    state = {name: shapes[name] for name in chosen}
+    aims = {name: [*np.shape(goals[0].state[name])] for name in needs.goal}
+    inputs = measure(scenes, card, task, state, aims, goals, seed)
+    return Lesson(card, task, scenes, inputs, usual_distance(scenes, task, goals))
+
+
+def chosen_fields(
+    world: WorldModel, card: EnvironmentCard, needed: Sequence[str], observe: Sequence[str] | None
+) -> list[str]:
+    """The fields to observe, in the model's order.
+
+    By default those that an estimator reads too, so that the policy can act from pictures, and
+    those that the task looks at; all that the model predicts if there is no estimator.
+    """
+    predicted = [*world.state_shapes]
+    for name in observe or ():
+        if name not in predicted:
+            known = ", ".join(predicted)
+            raise RecipeError(
+                f"observe={name}: the model does not predict it{suggest(name, predicted)}; it "
+                f"predicts {known}"
+            )
+    if observe is not None:
+        return [name for name in predicted if name in observe]
+    estimator = estimator_for(card)
+    readable = predicted if estimator is None else [*estimator.fields, *needed]
+    return [name for name in predicted if name in readable]
+
+
+def measure(
+    scenes: Scenes,
+    card: EnvironmentCard,
+    task: Task,
+    state: Mapping[str, list[int]],
+    aims: Mapping[str, list[int]],
+    goals: Sequence[Goal],
+    seed: int,
+) -> PolicyInputs:
+    """What a policy observes, with the scale of it under random actions."""
+    rng, low, high = np.random.default_rng(seed), card.action.low, card.action.high
+    length = -(-task.max_steps // scenes.repeat)
+    states, changes = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
+    for _ in range(max(1, MEASURED // (scenes.number * length))):
+        begun = rng.integers(scenes.starts, size=scenes.number).tolist()
+        now = side_by_side(scenes.begin(range(scenes.number), begun)[0], state)
+        for _ in range(length):
+            shape = scenes.number, card.action.size
+            actions = rng.uniform(low, high, shape).astype(np.float32).clip(low, high)
+            later = side_by_side(_last(scenes.step(actions.astype(np.float32))), state)
+            states.append(later)
+            changes.append(later - now)
+            now = later
+    mean, std = _scale(np.concatenate(states))
+    _, change = _scale(np.concatenate(changes))
+    of_state, place = dict[str, slice](), 0
+    for name, shape in state.items():
+        of_state[name] = slice(place, place := place + math.prod(shape))
+    for name, shape in aims.items():
+        if name in of_state and state[name] == shape:  # alike are scaled alike
+            more = mean[of_state[name]], std[of_state[name]]
+        else:
+            more = _scale(
+                side_by_side({name: np.stack([g.state[name] for g in goals])}, {name: shape})
+            )
+        mean, std = np.concatenate([mean, more[0]]), np.concatenate([std, more[1]])
+    return PolicyInputs(dict(state), dict(aims), mean.tolist(), std.tolist(), change.tolist())
+
+
+def usual_distance(scenes: Scenes, task: Task, goals: Sequence[Goal]) -> float:
+    """The mean distance of the starts from their goals."""
+    found = list[float]()
+    for first in range(0, len(goals), scenes.number):
+        which = range(min(scenes.number, len(goals) - first))
+        states, aims = scenes.begin(which, [first + row for row in which])
+        one = {name: np.asarray(values)[:, None] for name, values in states.items()}
+        count = len(which)
+        unknown, once = np.full(count, np.nan), np.ones(count, np.int64)
+        judged = judge(task, one, aims, unknown, np.zeros(count, np.bool_), once)
+        found += judged.distance[np.isfinite(judged.distance)].tolist()
+    if not found or not np.mean(found) > 0:
+        raise RecipeError(
+            f"the task {task.name!r} sees no distance at the start in what the model predicts, so "
+            "no policy can be trained in it"
+        )
+    return float(np.mean(found))
+
+
+def _scale(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and standard deviation `[S]` of what is known of `[N, S]`; 0 and 1 where nothing is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        known = np.where(np.isfinite(values), values, np.nan)
+        mean, std = np.nanmean(known, 0), np.nanstd(known, 0)
+    return np.nan_to_num(mean), np.where(np.isfinite(std) & (std > 1e-9), std, 1.0)
+
+
+def _last(states: States) -> dict[str, Any]:
+    return {name: values[:, -1] for name, values in states.items()}

@@ -1,0 +1,102 @@
+"""`acwm policy evaluate`, and other uses of a policy's file, with a policy that is best."""
+
+import json
+
+import numpy as np
+import pytest
+
+from acwm_core.cli import main
+from acwm_core.env.task import Goal
+from acwm_core.errors import RecipeError
+from acwm_core.evaluation.statistics import paired_bootstrap
+from acwm_core.training.run import load_run
+from acwm_planning.policies.own import OwnPolicy
+from acwm_planning.policies.run import rank_policies
+from acwm_planning.policies.saved import SavedPolicy
+from tests import tiny
+from tests.extras import needs
+from tests.learning.world import straight
+
+
+@pytest.fixture
+def policy(parts, tmp_path):
+    return straight(tmp_path / "policy")
+
+
+def reachable(seed):
+    """Whether twelve actions of two pixels lead to the goal, and how far it is."""
+    env = tiny.task_environment()
+    _, info = env.reset(options={"spec": tiny.spec(seed)})
+    away = np.abs(env.goal.state["position"] - info["state"]["position"])
+    return bool(np.linalg.norm(np.maximum(away - 24, 0)) <= tiny.PLACE.tolerance)
+
+
+@needs("stable_baselines3")
+def test_the_best_policy_solves_what_can_be_solved(run, policy, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["policy", "evaluate", str(policy), "--run", str(run), "--seeds", "0..7"])
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    found = json.loads((policy / "evaluation" / "evaluation.json").read_text())
+    rows = {row["row"]: row for row in found["rows"]}
+    assert [*rows] == ["trained", "dream", "solution", "random", "still"]
+    can = [seed for seed in range(8) if reachable(seed)]
+    assert rows["trained"]["successes"] == rows["solution"]["successes"] == len(can)
+    assert rows["still"]["successes"] == 0
+    assert rows["trained"]["seeds"] == rows["still"]["seeds"] == [*range(8)]
+    assert rows["trained"]["success"]["low"] < 1
+    lines = (policy / "evaluation" / "episodes.jsonl").read_text().splitlines()
+    won = {(each["row"], each["seed"]): each["success"] for each in map(json.loads, lines)}
+    gaps = [won["dream", seed] - float(won["trained", seed]) for seed in range(8)]
+    assert found["gap"]["mean"] == pytest.approx(paired_bootstrap(gaps).mean)
+    assert "the same, in the dream" in said
+    assert f"{len(can)}/8" in said
+
+
+@needs("stable_baselines3")
+def test_the_dream_judges_as_the_task_does(run, policy):
+    """The model is exact but for the half pixel that it reads, so both end alike, step by step."""
+    from acwm_policy.evaluate import evaluate_policy
+
+    evaluate_policy(policy, seeds=range(6), run=run, device="cpu")
+    text = (policy / "evaluation" / "episodes.jsonl").read_text()
+    lines = {(each["row"], each["seed"]): each for each in map(json.loads, text.splitlines())}
+    for seed in range(6):
+        dreamt, simulated = lines["dream", seed], lines["trained", seed]
+        assert dreamt["start_distance"] == pytest.approx(simulated["start_distance"], abs=0.71)
+        assert dreamt["distance"] == pytest.approx(simulated["distance"], abs=2.1)
+        assert abs(dreamt["steps"] - simulated["steps"]) <= 1
+
+
+def test_a_file_is_an_own_policy(run, policy, tmp_path):
+    """In a ranking it acts on what the estimator reads, in the simulator and in the model."""
+    ranking = rank_policies(
+        run, "place", [str(policy)], seeds=range(3), out=tmp_path / "out", device="cpu"
+    )
+    (scores,) = ranking.policies
+    assert scores.policy == str(policy)
+    assert scores.loop == "closed"
+    can = sum(map(reachable, range(3))) / 3
+    assert scores.success["truth"] == pytest.approx(can)
+    with pytest.raises(RecipeError, match=r"trained for slide\.place, not for slide\.shy"):
+        rank_policies(run, "shy", [str(policy)], seeds=[0], out=tmp_path / "shy", device="cpu")
+
+
+def test_what_is_unseen_is_taken_to_be_as_it_was(policy):
+    card = tiny.Slide.card
+    own = OwnPolicy(str(policy), card)
+    own.reset(Goal({"position": np.array([20.0, 4.0])}, np.zeros(0), np.zeros(0)))
+    assert own.act(np.zeros(0), {"position": np.array([4.0, 4.0])}).tolist() == [2, 0]
+    hidden = own.act(np.zeros(0), {"position": np.array([np.nan, 0.0])})
+    assert hidden.tolist() == [2, 1]
+    saved = SavedPolicy.read(policy)
+    saved.reset(Goal({"position": np.zeros(2)}, np.zeros(0), np.zeros(0)))
+    with pytest.raises(RecipeError, match=r"observes position, which nothing here reads"):
+        saved.predict({"velocity": np.zeros(2)})
+
+
+def test_a_policy_of_another_world_is_refused(policy, run):
+    card = load_run(run).card
+    with pytest.raises(RecipeError, match=r"trained for slide\.place, not for unread\.place"):
+        OwnPolicy(str(policy), tiny.Unread.card)
+    assert OwnPolicy(str(policy), card).observes == "state"

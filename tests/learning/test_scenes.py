@@ -1,0 +1,158 @@
+"""Scenes of which only the states are known: those of the model, of the simulator, of the task."""
+
+import numpy as np
+import pytest
+import torch
+
+from acwm_core.data.simulate import make_environment
+from acwm_core.env.task import TaskEnvironment
+from acwm_core.errors import RecipeError
+from acwm_core.training.run import load_run
+from acwm_planning.policies.saved import PolicyInputs
+from acwm_policy.lesson import begin_episodes, find_task, prepare
+from acwm_policy.scenes import DreamScenes, SimulatorScenes
+from tests import tiny
+from tests.extras import needs
+from tests.scene.dots import world_of
+from tests.scene.test_values import model_of_arms
+
+INPUTS = PolicyInputs({"position": [2]}, {"position": [2]}, [0.0] * 4, [1.0] * 4, [1.0] * 2)
+
+
+@pytest.fixture(scope="module")
+def bundle(run):
+    return load_run(run)
+
+
+@pytest.fixture(scope="module")
+def begun(bundle):
+    return begin_episodes(bundle.card, 1, tiny.PLACE, 6)
+
+
+def rows(steps, number, seed=0):
+    drawn = np.random.default_rng(seed).uniform(-2, 2, (steps, number, 2))
+    return drawn.astype(np.float32)
+
+
+def arms(stride):
+    """A scene whose layers have random weights, as a world model."""
+    model = model_of_arms(temporal_stride=stride, latent_channels=768).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return world_of(model, stride, states=4).eval()
+
+
+def test_carried_states_are_the_predicted_ones():
+    """Of scenes that begin together, and of one that begins when the others are under way."""
+    world, random = arms(4), torch.Generator().manual_seed(0)
+    frames = torch.rand(3, 3, 32, 32, generator=random)
+    actions = torch.rand(3, 17, 2, generator=random) - 0.5
+    whole = world.predict_states(frames, actions)["all"]
+    stream = world.stream_states(frames)
+    begun = stream.picked(torch.tensor([2]))
+    first = begun.current["all"]
+    passed = [stream.step(actions[:, k : k + 4])["all"] for k in range(0, 16, 4)]
+    torch.testing.assert_close(torch.cat(passed, 1), whole, atol=1e-5, rtol=1e-5)
+    assert (whole[:, -1] - whole[:, 0]).abs().max() > 0.01
+    torch.testing.assert_close(stream.current["all"], passed[-1][:, -1])
+    stream.put(torch.tensor([1]), begun)
+    torch.testing.assert_close(stream.current["all"][1:2], first)
+    later = [stream.step(actions[[0, 2, 1], k : k + 4])["all"] for k in range(0, 16, 4)]
+    torch.testing.assert_close(torch.cat(later, 1)[1], whole[2], atol=1e-5, rtol=1e-5)
+
+
+def test_a_model_that_carries_no_states_says_so(tmp_path):
+    bundle = load_run(tiny.make_exact_run(tmp_path / "run", states=["position"]))
+    with pytest.raises(RecipeError, match="Exact carries no states"):
+        bundle.world_model.stream_states(torch.zeros(1, 3, 32, 32))
+
+
+def test_dreamt_scenes_are_the_simulated_ones(bundle, begun):
+    """The model reads whole pixels and is exact from there on."""
+    goals = [start.goal for start in begun.starts]
+    dream = DreamScenes(bundle.world_model, begun.starts, 3)
+    simulated = SimulatorScenes(bundle.card, begun.specs, goals, dream.repeat, 3)
+    for scenes in (dream, simulated):
+        scenes.begin([0, 1, 2], [4, 1, 0])
+    for step, actions in enumerate(rows(4, 3)):
+        if step == 2:
+            (one, aims), (other, same) = (each.begin([1], [5]) for each in (dream, simulated))
+            assert aims[0] is same[0] is goals[5]
+            assert np.abs(one["position"] - other["position"]).max() <= 0.5
+        passed = dream.step(actions)["position"]
+        assert passed.shape == (3, 4, 2)
+        assert np.abs(passed - simulated.step(actions)["position"]).max() <= 0.51
+
+
+@needs("stable_baselines3")
+@pytest.mark.parametrize("task", [tiny.PLACE, tiny.SHY], ids=["place", "shy"])
+def test_reward_and_ends_are_those_of_the_task(bundle, begun, task):
+    """Against the simulator with its task, action by action, until every scene has ended."""
+    from acwm_policy.vector import TaskScenes
+
+    goals, number, moves = [start.goal for start in begun.starts], 6, rows(3, 6, seed=1)
+    for row, start in enumerate(begun.starts[:3]):  # these go where they are to go
+        away = start.goal.state["position"] - world_start(begun.specs[row])
+        moves[:, row] = np.clip(away / tiny.STRIDE / np.arange(1, 4)[:, None], -2, 2)
+    scenes = SimulatorScenes(bundle.card, begun.specs, goals, tiny.STRIDE, number)
+    vector = TaskScenes(scenes, task, bundle.card, INPUTS, unit=2.0, bonus=5.0)
+    vector.begin(range(number))
+    total, ended = np.zeros(number), {}
+    for actions in moves:
+        vector.step_async(actions / 2)
+        _, rewards, over, infos = vector.step_wait()
+        for row in range(number):
+            if row not in ended:
+                total[row] += rewards[row]
+                if over[row]:
+                    ended[row] = infos[row]
+    assert len(ended) == number  # after three steps, the task's twelve actions
+    for row in range(number):
+        env = TaskEnvironment(make_environment("slide", {"size": (32, 32)}), task)
+        _, info = env.reset(options={"spec": begun.specs[row], "goal": goals[row]})
+        begin, solved, late = info["distance"], False, False
+        for action in np.repeat(moves[:, row], tiny.STRIDE, 0):
+            if not (solved or late):
+                _, _, solved, late, info = env.step(action)
+        assert ended[row]["is_success"] == solved
+        assert ended[row]["TimeLimit.truncated"] == (late and not solved)
+        assert ended[row]["failed"] == info["failed"]
+        assert total[row] == pytest.approx((begin - info["distance"]) / 2 + 5 * solved, abs=1e-5)
+    if task is tiny.PLACE:
+        assert {info["is_success"] for info in ended.values()} == {True, False}
+
+
+def world_start(spec):
+    env = make_environment("slide", {"size": (32, 32)})
+    return env.reset(options={"spec": spec})[1]["state"]["position"]
+
+
+@needs("stable_baselines3")
+def test_an_ended_scene_shows_its_last_state_and_begins_anew(bundle, begun):
+    from acwm_policy.vector import TaskScenes
+
+    lesson = prepare(bundle, tiny.PLACE, begun, "dream", 4)
+    assert lesson.inputs.state == lesson.inputs.goal == {"position": [2]}
+    vector = TaskScenes(lesson.scenes, tiny.PLACE, bundle.card, INPUTS, unit=1.0)
+    vector.begin([0, 1, 2, 3])
+    for step in range(3):
+        vector.step_async(np.full((4, 2), -1.0))
+        shown, _, over, infos = vector.step_wait()
+        for row in np.flatnonzero(over):
+            last = infos[row]["terminal_observation"]
+            assert np.abs(last[:2]).max() <= 24 - 8 * (step + 1)  # of 24 pixels, 8 a step
+            assert np.array_equal(shown[row, 4:], [0, 0])  # nothing has moved yet
+    assert over.any()
+
+
+def test_a_task_that_looks_at_more_is_refused(bundle, begun):
+    class Elsewhere(tiny.ToPlace):
+        def distance(self, seen, goal):
+            return np.asarray(seen.states["velocity"])[:, 0]
+
+    with pytest.raises(RecipeError, match="predicts position, and the task 'place' looks at more"):
+        prepare(bundle, Elsewhere(), begun, "dream", 2)
+    with pytest.raises(RecipeError, match="is a task of reacher, but the model is of slide"):
+        find_task("reacher.reach", bundle.card)
+    with pytest.raises(RecipeError, match="does not predict it; did you mean 'position'"):
+        prepare(bundle, tiny.PLACE, begun, "dream", 2, ["positon"])

@@ -1,0 +1,212 @@
+"""`acwm policy train`: what is learnt, what a file holds, and what a killed command leaves."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from acwm_core.cli import main
+from acwm_core.errors import DataError, MissingExtraError, RecipeError
+from acwm_core.training.run import load_run
+from acwm_planning.policies.saved import SavedPolicy, raw_actions
+from acwm_policy import settings as settings_module
+from acwm_policy.settings import PolicySettings, settings_of
+from tests import tiny
+from tests.extras import needs
+from tests.learning.world import straight
+
+SMALL = {
+    "learning_rate": 3e-3,
+    "batch_size": 64,
+    "policy_kwargs": {"net_arch": [32, 32]},
+}
+
+
+def train(run, out, *, steps, algorithm="sac", parameters=SMALL, **options):
+    from acwm_policy.train import train_policy
+
+    settings = PolicySettings(algorithm=algorithm, parameters=dict(parameters))
+    options = {"scenes": 8, "starts": 16, "device": "cpu", **options}
+    return train_policy(run, "slide.place", settings=settings, out=out, steps=steps, **options)
+
+
+@needs("stable_baselines3")
+@pytest.mark.parametrize("algorithm", ["sac", "ppo", "td3"])
+def test_the_file_acts_as_the_learner_does(run, algorithm):
+    """Without the library, the saved network gives the library's own deterministic actions."""
+    from acwm_policy.learner import make_learner, network_in
+    from acwm_policy.lesson import begin_episodes, prepare
+    from acwm_policy.vector import TaskScenes
+
+    bundle = load_run(run)
+    begun = begin_episodes(bundle.card, 1, tiny.PLACE, 2)
+    lesson = prepare(bundle, tiny.PLACE, begun, "dream", 2)
+    vector = TaskScenes(lesson.scenes, tiny.PLACE, bundle.card, lesson.inputs, unit=1.0)
+    learner = make_learner(PolicySettings(algorithm), vector, 0)
+    observed = np.random.default_rng(0).normal(0, 3, (50, 6)).astype(np.float32)
+    wanted, _ = learner.predict(observed, deterministic=True)
+    _, network = network_in(learner)
+    with torch.no_grad():
+        found = network(torch.from_numpy(observed)).numpy()
+    assert np.abs(found.clip(-1, 1) - wanted).max() < 1e-5
+    assert np.ptp(wanted) > 0.01
+
+
+@needs("stable_baselines3")
+@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
+def test_a_killed_training_goes_on(run, tmp_path, monkeypatch, algorithm):
+    """It ends after its fifth checkpoint; the next command has all that was learnt till then."""
+    from acwm_policy import train as module
+
+    class Killed(BaseException):
+        pass
+
+    kept, restored = [], []
+    save, restore = module.save_checkpoint, module.restore
+
+    def save_and_die(path, learner, scenes, **more):
+        save(path, learner, scenes, **more)
+        kept.append(learner)
+        if len(kept) == 5:
+            raise Killed
+
+    def look(learner, scenes, whole):
+        restore(learner, scenes, whole)
+        assert learner.num_timesteps == kept[4].num_timesteps
+        assert learner._n_updates == kept[4]._n_updates
+        for name in learner._get_torch_save_params()[0]:
+            one, other = (_tensors(_member(each, name).state_dict()) for each in (learner, kept[4]))
+            assert len(one) == len(other) > 0
+            assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
+        if algorithm == "sac":
+            held, before = learner.replay_buffer, kept[4].replay_buffer
+            assert held.pos == before.pos > 0
+            assert np.array_equal(held.next_observations, before.next_observations)
+            assert torch.equal(learner.log_ent_coef, kept[4].log_ent_coef)
+        restored.append(learner)
+
+    few = {"learning_starts": 16, "gradient_steps": 1} if algorithm == "sac" else {"n_steps": 8}
+    wanted = {"steps": 320, "algorithm": algorithm, "parameters": {**SMALL, **few}}
+    monkeypatch.setattr(module, "save_checkpoint", save_and_die)
+    with pytest.raises(Killed):
+        train(run, tmp_path / "policy", **wanted)
+    monkeypatch.setattr(module, "save_checkpoint", save)
+    monkeypatch.setattr(module, "restore", look)
+    policy = train(run, tmp_path / "policy", **wanted)
+    assert restored
+    assert policy.card.training["steps"] >= 320
+    rows = [*csv.reader((tmp_path / "policy" / "curve.csv").open())]
+    assert rows[0] == ["steps", "success", "return", "cpu_seconds"]
+    steps = [int(row[0]) for row in rows[1:]]
+    assert steps == sorted({*steps})
+    assert steps[0] < kept[4].num_timesteps < steps[-1]
+
+
+def _member(learner, name):
+    for part in name.split("."):
+        learner = getattr(learner, part)
+    return learner
+
+
+def _tensors(tree):
+    if isinstance(tree, torch.Tensor):
+        return [tree]
+    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    return [tensor for part in parts for tensor in _tensors(part)]
+
+
+@needs("stable_baselines3")
+def test_it_trains_in_the_simulator_and_no_other_policy_goes_on(run, tmp_path):
+    few = {**SMALL, "learning_starts": 8}
+    options = {"steps": 24, "parameters": few, "place": "simulator", "scenes": 2}
+    policy = train(run, tmp_path / "policy", **options)
+    assert policy.card.training["place"] == "simulator"
+    assert policy.card.inputs.state == {"position": [2]}
+    with pytest.raises(DataError, match="holds a policy with another place, seed: choose another"):
+        train(run, tmp_path / "policy", **{**options, "place": "dream", "seed": 1})
+
+
+@needs("stable_baselines3")
+@pytest.mark.ci
+def test_it_learns_to_go_straight_to_the_goal(run, tmp_path):
+    """In the dream alone; in the simulator it solves nearly what the best policy solves."""
+    from acwm_policy.evaluate import evaluate_policy
+
+    few = {**SMALL, "gradient_steps": 2, "learning_starts": 256, "gamma": 0.95}
+    train(run, tmp_path / "policy", steps=5000, scenes=16, starts=64, parameters=few)
+    found = evaluate_policy(tmp_path / "policy", seeds=range(30), run=run, device="cpu")
+    share = {row["row"]: row["successes"] for row in found["rows"]}
+    best = evaluate_policy(straight(tmp_path / "best"), seeds=range(30), run=run, device="cpu")
+    (most,) = (row["successes"] for row in best["rows"] if row["row"] == "trained")
+    assert share["trained"] >= 0.85 * most
+    assert share["random"] < 0.6 * most
+
+
+@needs("stable_baselines3")
+def test_parameters_are_those_of_the_algorithm():
+    found = settings_of(["algorithm=td3", "policy_delay=3", "observe=[position]", "bonus=2"])
+    assert found == PolicySettings("td3", ["position"], 2.0, {"policy_delay": 3})
+    nested = settings_of(["learning_rate=1e-3", "policy_kwargs.net_arch=[8]"])
+    assert nested.parameters == {"learning_rate": 1e-3, "policy_kwargs": {"net_arch": [8]}}
+    for words, said in {
+        "learnin_rate=1": "sac has no parameter 'learnin_rate'; did you mean 'learning_rate'",
+        "policy_delay=3": "it has learning_rate, buffer_size",
+        "batch_size=big": "batch_size=big: expected int",
+        "algorithm=sacc": "there is no algorithm 'sacc'; did you mean 'sac'?",
+        "policy_kwargs.activation_fn=relu": "of policy_kwargs only net_arch can be set",
+        "env=reacher": "sac has no parameter 'env'",
+    }.items():
+        with pytest.raises(RecipeError) as refused:
+            settings_of([words])
+        assert said in str(refused.value)
+
+
+def test_without_the_library_the_message_names_the_extra(monkeypatch):
+    monkeypatch.setattr(settings_module, "LIBRARY", "no_such_library")
+    with pytest.raises(MissingExtraError, match=r"pip install 'acwm\[policies\]'"):
+        settings_of([])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train reach", "give ENVIRONMENT.TASK, such as reacher.reach"),
+        ("train slide.place one two", "give one model, not one, two"),
+        ("evaluate nowhere", "there is no policy's folder nowhere"),
+    ],
+)
+def test_wrong_words_are_one_sentence(capsys, words, said):
+    with pytest.raises(SystemExit) as ended:
+        main(["policy", *words.split()])
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_actions_are_in_the_units_of_the_card():
+    low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
+    found = raw_actions(np.array([[-1.0, 0.0], [3.0, -7.0], [0.5, 1.0]]), low, high)
+    assert found.tolist() == [[-2, 5], [2, 0], [1, 10]]
+
+
+def test_a_damaged_policy_is_refused(tmp_path):
+    with pytest.raises(DataError, match="holds no policy"):
+        SavedPolicy.read(tmp_path)
+    (tmp_path / "policy.safetensors").write_bytes(b"nonsense")
+    with pytest.raises(DataError, match="is no policy of this version"):
+        SavedPolicy.read(tmp_path)
+    whole = SavedPolicy.read(straight(tmp_path / "policy"))
+    narrow = replace(whole.card.inputs, change=[1.0])
+    SavedPolicy(replace(whole.card, inputs=narrow), nn.Linear(6, 2)).save(tmp_path)
+    with pytest.raises(DataError, match="is no policy of this version"):
+        SavedPolicy.read(tmp_path)
+
+
+def test_settings_are_written_as_they_were_given(tmp_path):
+    from acwm_policy.train import _opened
+
+    with _opened(tmp_path / "policy", {"seed": 1}):
+        assert json.loads((tmp_path / "policy" / "settings.json").read_text()) == {"seed": 1}
