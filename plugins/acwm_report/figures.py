@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,10 @@ _STYLE = {
 }
 
 _MATPLOTLIB: Any = mpl  # its type annotations are incomplete
+
+_SVGS: dict[str, Markup] = {}
+MOST_SVGS = 64
+"""Charts of this process that are kept: whoever writes a page again draws only what has changed."""
 
 Numbers = Sequence[float | None]
 """Values to draw; None leaves a gap."""
@@ -113,6 +118,14 @@ class Chart:
     @property
     def svg(self) -> Markup:
         """Inline SVG in the colours and fonts of the page around it."""
+        key = json.dumps(asdict(self), default=lambda numbers: numbers.tolist())
+        if key not in _SVGS:
+            if len(_SVGS) >= MOST_SVGS:
+                _SVGS.clear()
+            _SVGS[key] = self._svg()
+        return _SVGS[key]
+
+    def _svg(self) -> Markup:
         names = dict.fromkeys([*(curve.colour for curve in self.curves), "line"])
         palette = {name: f"#0000{index:02x}" for index, name in enumerate(names, start=16)}
         file = io.StringIO()
