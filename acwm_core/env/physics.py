@@ -273,7 +273,9 @@ class StateEstimator(ABC):
             owner = type(self).__name__
             raise PluginError(f"{owner}.estimate gives no Observation of {', '.join(self.fields)}")
         check_shape(self, "estimate (masks)", seen.masks, frames, *size)
-        for field in (declared for declared in self.card.state if declared.name in self.fields):
+        for field in self.card.state:
+            if field.name not in self.fields:
+                continue
             method = f"estimate ({field.name})"
             check_shape(self, method, seen.states[field.name], frames, *field.shape)
             if np.isinf(seen.states[field.name]).any():
