@@ -184,9 +184,9 @@ def _check_seen(
     if there.sum() < FEWEST:
         return
     pixels = camera.project(lifted(values[there], points.plane), height, width)[:, :2]
+    shown: list[NDArray[np.bool_]] = [np.asarray(mask[there].any(axis)) for axis in (1, 2)]
     edges = [
-        np.stack([shown.argmax(1), shown.shape[1] - shown[:, ::-1].argmax(1)], -1)
-        for shown in (mask[there].any(axis) for axis in (1, 2))
+        np.stack([line.argmax(1), line.shape[1] - line[:, ::-1].argmax(1)], -1) for line in shown
     ]
     low, high = np.moveaxis(np.stack(edges, 1), -1, 0)
     away = np.linalg.norm(np.maximum(0, np.maximum(low - pixels, pixels - high)), axis=1) / height

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+from h5py import h5o
 
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
@@ -134,7 +135,7 @@ def _below(group: Any) -> list[tuple[str, Any]]:
 
 def identity(item: Any) -> tuple[str, int]:
     """What tells a group or dataset from all others: its file, and its place there."""
-    return os.path.realpath(item.file.filename), h5py.h5o.get_info(item.id).addr
+    return os.path.realpath(item.file.filename), h5o.get_info(item.id).addr
 
 
 def layout_of(file: Any) -> ArrayLayout | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
+from h5py import h5o
 
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, check_regular
@@ -148,8 +149,8 @@ def _arrays(file: Any) -> list[bytes]:
     names: list[bytes] = []
 
     def look(name: bytes, info: Any) -> None:
-        if info.type == h5py.h5o.TYPE_DATASET:
+        if info.type == h5o.TYPE_DATASET:
             names.append(name)
 
-    h5py.h5o.visit(file.id, look, info=True)
+    h5o.visit(file.id, look, info=True)
     return names

@@ -186,7 +186,7 @@ class _Checked(WrapperStore[Any]):
         """
         found = await super().get(key, prototype, byte_range)
         if found is not None:
-            check_packed(memoryview(found.as_numpy_array()).cast("B"))
+            check_packed(found.as_numpy_array().view(np.uint8).data)
         return found
 
 

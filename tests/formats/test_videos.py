@@ -157,7 +157,7 @@ REFUSED = {
     "no video": ({"a.csv": CSV}, {}, "holds no video"),
     "an unknown column": ({"a.mp4": None, "a.csv": CSV}, {"columns": "pusch"}, "mean 'push'"),
     "no action": ({"a.mp4": None, "a.csv": "time\n0\n"}, {}, "no column of actions"),
-    "a decimal comma": ({"a.mp4": None, "a.csv": "push;turn\n1,5;2\n"}, {}, "holds '1,5'"),
+    "a decimal comma": ({"a.mp4": None, "a.csv": "push\tturn\n1,5\t2\n"}, {}, "holds '1,5'"),
     "no row": ({"a.mp4": None, "a.csv": "push\n"}, {}, "holds no row"),
     "several tables": (
         {"a.mp4": None, "x.csv": CSV, "y.csv": CSV},
