@@ -28,16 +28,17 @@ def tracks_of(world_model: object, prediction: Prediction) -> Tracks | None:
         later = world_model.predict_keypoints(
             true[:, : clip.given], actions, seeds=draw_seeds(clip.seed, 1)
         )
-    kept = [number for number, share in enumerate(seen.shares.tolist()) if share >= LEAST_SHARE]
+    shares = seen.shares.cpu().numpy()
+    kept = [number for number, share in enumerate(shares) if share >= LEAST_SHARE]
     given = seen.values[0, : seen.values.shape[1] - later.values.shape[1]]
 
     def places(values: torch.Tensor) -> list[list[list[float | None]]]:
-        rows = ((values[:, kept, :2] + 1) / 2).cpu().tolist()
+        rows = (values[:, kept, :2].cpu().numpy() + 1) / 2
         return [[[_rounded(number) for number in place] for place in row] for row in rows]
 
     return Tracks(
         names=[world_model.keypoint_names[number] for number in kept],
-        shares=[round(float(seen.shares[number]), 3) for number in kept],
+        shares=[round(float(shares[number]), 3) for number in kept],
         every=stride,
         seen=places(seen.values[0]),
         predicted=places(torch.cat([given, later.values[0]])),
@@ -45,4 +46,4 @@ def tracks_of(world_model: object, prediction: Prediction) -> Tracks | None:
 
 
 def _rounded(number: float) -> float | None:
-    return round(number, 4) if number == number else None
+    return round(float(number), 4) if number == number else None

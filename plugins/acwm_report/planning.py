@@ -185,7 +185,8 @@ def plan_to_picture(
     planner = PicturePlanner(bundle, settings, device, action_std_of(run))
     size = bundle.card.frame_size
     if start is not None:
-        frames, actions = [picture_of_size(start, size)], []
+        now = picture_of_size(start, size)
+        frames, actions, reached = [now], [], now
     else:
         ahead = settings.planner.get("horizon", 5) * settings.planner.get("action_block", 4)
         data = bundle.recipe.data["path"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,8 @@ class Movements:
             return None
         usual = np.median(self._rests, 0)
         apart = [float(_differ(rest, usual).mean()) for rest in self._rests]
-        return Movement(*np.median(self._rows, 0).tolist(), float(np.median(apart)))
+        border, changed, things = (float(value) for value in np.median(self._rows, 0))
+        return Movement(border, changed, things, float(np.median(apart)))
 
 
 def movement(videos: Iterable[NDArray[np.uint8]]) -> Movement | None:
@@ -106,6 +108,6 @@ def _border(frames: Floats) -> float:
 
 
 def _things(differs: NDArray[np.bool_]) -> int:
-    marked, _ = ndimage.label(differs, np.ones((3, 3)))
+    marked, _ = cast(tuple[NDArray[np.int32], int], ndimage.label(differs, np.ones((3, 3))))
     sizes = np.bincount(marked.ravel())[1:]
     return int((sizes >= max(4, SMALLEST * differs.size)).sum())
