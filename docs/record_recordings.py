@@ -21,7 +21,6 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from acwm_core.data.card import DatasetCard
 from acwm_core.data.clips import hold_out, take_fraction
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.recipe import Recipe
@@ -53,9 +52,8 @@ def main(runs: Sequence[str]) -> None:
 
 def recordings(run: Path) -> int:
     """How many episodes a run learnt from."""
-    folder = RunFolder(run)
-    data, card = Recipe.from_yaml(folder.recipe).data, DatasetCard.read(folder.card)
-    training, _ = hold_out(card.episodes["train"], data["validation_episodes"])
+    data = Recipe.from_yaml(RunFolder(run).recipe).data
+    training, _ = hold_out(len(EpisodeDataset(data["path"], "train")), data["validation_episodes"])
     return len(take_fraction(training, data["fraction"]))
 
 
