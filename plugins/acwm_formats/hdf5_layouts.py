@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from h5py import h5o
 
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
@@ -25,6 +25,8 @@ from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import natural
 from acwm_formats.robosuite import robosuite
 from acwm_formats.sources import files_in
+
+h5o: Any = importlib.import_module("h5py.h5o")  # h5py does not say that it has it
 
 ENDINGS = (".hdf5", ".h5")
 ALOHA_RATE = Fraction(50)  # the layout does not say it; all of its recorders have a step of 20 ms

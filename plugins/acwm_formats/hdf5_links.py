@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 from collections.abc import Iterator
@@ -9,10 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
-from h5py import h5o
 
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, check_regular
+
+h5o: Any = importlib.import_module("h5py.h5o")  # h5py does not say that it has it
 
 ADVICE = "give --follow-links to read it"
 
