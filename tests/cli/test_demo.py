@@ -54,13 +54,13 @@ def test_the_time_left_is_that_of_all_steps(monkeypatch, capsys):
 
         return work
 
-    demo._work_through(
-        demo.Step("done before", 120, taking(0, done=False)),
-        demo.Step("twice as slow as expected", 60, taking(120)),
-        demo.Step("the rest", 240, taking(480)),
-    )
-    told = [line for line in capsys.readouterr().err.splitlines() if "left" in line]
-    assert [line.split("about ")[1] for line in told] == [
+    progress = demo.Progress(3)
+    before = demo.Step("done before", 120, taking(0, done=False))
+    slow = demo.Step("twice as slow as expected", 60, taking(120))
+    progress.work((before, slow), later=240)
+    progress.work((demo.Step("the rest", 240, taking(480)),))
+    lines = [line for line in capsys.readouterr().err.splitlines() if "left" in line]
+    assert [line.split("about ")[1] for line in lines] == [
         f"{minutes} min left" for minutes in (7, 5, 8)
     ]
 

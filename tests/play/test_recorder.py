@@ -8,7 +8,7 @@ import pytest
 from acwm_core.data.card import CARD
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_formats.check import check_dataset
-from acwm_play.recorder import Recording, save
+from acwm_play.recorder import PlayedEpisode, save
 from acwm_play.simulator import TimeStep
 from tests import tiny
 
@@ -24,7 +24,7 @@ def time_step(place):
 
 
 def recording(frames):
-    return Recording([time_step(n) for n in range(frames)], [time_step(0).frame] * frames)
+    return PlayedEpisode([time_step(n) for n in range(frames)], [time_step(0).frame] * frames)
 
 
 @pytest.fixture(autouse=True, scope="module")
