@@ -56,12 +56,13 @@ def test_what_is_constant_has_no_correlation():
 
 @pytest.mark.ci
 def test_intervals_cover_policies_and_episodes():
-    intervals = functools.partial(agreement, resamples=200)
+    intervals, random = functools.partial(agreement, resamples=200), np.random.default_rng(0)
     skill = np.linspace(0, 1, 12)[:, None]
-    judge, truth = (skill + 0.3 * RNG.normal(size=(12, 10)) for _ in range(2))
-    few, many = (intervals(judge[:, :n], truth[:, :n]).spearman for n in (5, 10))
-    assert few.low < few.value < few.high <= 1
-    assert many.low > few.low
+    judge, truth = (skill + 0.3 * random.normal(size=(12, 10)) for _ in range(2))
+    noisy = skill + 0.3 * random.normal(size=(8, 2, 12, 40))
+    few, many = ([intervals(*each[..., :n]).spearman for each in noisy] for n in (5, 40))
+    assert all(each.low < each.value < each.high <= 1 for each in few)
+    assert sum(each.low for each in many) > sum(each.low for each in few)
     # with fewer episodes they are of policies alone, and so of any number of the same ones
     one = intervals(judge[:, :1], truth[:, :1]).spearman
     assert one.low < one.value < one.high
