@@ -111,12 +111,12 @@ def _opened(out: Path, about: Mapping[str, Any]) -> Any:
     Raises:
         DataError: it holds a policy that was trained otherwise.
     """
-    told, path = json.loads(json.dumps(about)), out / SETTINGS_FILE
+    described, path = json.loads(json.dumps(about)), out / SETTINGS_FILE
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     if path.exists() and (out / CHECKPOINT).exists():
         stored = read_json(path, dict[str, Any], "settings of a policy")
-        others = sorted(name for name in told if stored.get(name) != told[name])
+        others = sorted(name for name in described if stored.get(name) != described[name])
         if others:
             raise DataError(
                 f"{out} holds a policy with another {', '.join(others)}: choose another --out, or "
@@ -124,7 +124,7 @@ def _opened(out: Path, about: Mapping[str, Any]) -> Any:
             )
     else:
         with written_whole(path) as partial:
-            partial.write_text(json.dumps(told, indent=1), encoding="utf-8")
+            partial.write_text(json.dumps(described, indent=1), encoding="utf-8")
     return held(out)
 
 

@@ -16,7 +16,7 @@ CLIPS = 128
 RATE = 3e-3
 """Peak learning rate."""
 
-MOTION = Stage("how things move", "objective.motion_steps", warmup=100, decay=1.6, clipped=0.5)
+MOTION = Stage("learning motion", "objective.motion_steps", warmup=100, decay=1.6, clipped=0.5)
 
 
 def learn_motion(model: SceneDynamics, clips: TrainingClips, states: Tensor, steps: int) -> None:

@@ -22,7 +22,7 @@ CLIPS, DRAWN = 8, 4
 RATE, MATRIX_RATE = 2e-3, 4e-3
 """Peak learning rates of AdamW and of Muon."""
 
-POINTS = Stage("what there is", "objective.point_steps", warmup=50, decay=1.25, clipped=1.0)
+POINTS = Stage("finding points", "objective.point_steps", warmup=50, decay=1.25, clipped=1.0)
 
 MEASURED_CLIPS, READ_AT_ONCE = 256, 64
 """Clips whose frames make up the average frame, and clips that are read at once."""

@@ -69,7 +69,7 @@ class Stage:
                 cast(Any, loss).backward()
                 if not nn.utils.clip_grad_norm_(weights, self.clipped).isfinite():
                     raise TrainingError(
-                        f"the loss of {self.name} is not finite in step {step + 1} of "
+                        f"{self.name}: the loss is not finite in step {step + 1} of "
                         f"{self.setting}: look at the data, and at data.states"
                     )
                 for optimizer, _ in optimizers:

@@ -29,15 +29,14 @@ QUICK_TESTS: Mapping[Split, int] = {"ind_test": 4, "ood_test": 4}
 SECONDS = 690
 """How long it should take: on a machine that is slower than the one of `Step` it is smaller."""
 
-SIZES = (1.0, 0.75, 0.5, 0.35)
+SHARES = (1.0, 0.75, 0.5, 0.35)
 """Shares of the episodes and of the training steps that it may have."""
 
-SIZE = "size.json"
+SHARE = "share.json"
 """File that keeps the share, so that a continued demo goes on as it began."""
 
 ALIKE = ("frames", "episodes", "counterfactual_episodes", "steps")
 """Settings of the evaluation that the shipped model takes from the demo."""
-
 
 SIMULATING, TRAINING, CLOSING = 90, 290, 44
 """Seconds of simulating the training episodes, of the training, and of what follows; see `Step`."""
@@ -151,14 +150,14 @@ class Progress:
 
 def share_of_time(folder: Path, progress: Progress) -> float:
     """The share of the episodes and steps that this machine has the time for."""
-    kept = folder / SIZE
+    kept = folder / SHARE
     if kept.exists():
         return float(json.loads(kept.read_text("utf-8"))["share"])
     if (folder / "run").exists():  # begun by a version that knew no shares
         return 1.0
     left = SECONDS - progress.spent - progress.pace * CLOSING
     affordable = left / (progress.pace * (SIMULATING + TRAINING))
-    share = next((each for each in SIZES if each <= affordable), SIZES[-1])
+    share = next((each for each in SHARES if each <= affordable), SHARES[-1])
     if share < 1:
         click.echo(
             f"this machine takes {progress.pace:.1f} times as long as two idle cores with AVX-512, "
