@@ -65,7 +65,6 @@ class Stream:
         generators: Sequence[torch.Generator],
     ) -> None:
         self._world = world
-        self._batch = len(generators)
         stride, frames = world.codec.temporal_stride, given.shape[1]
         if list(actions.shape[:2]) != [len(given), frames - 1]:
             raise ShapeError(
@@ -131,7 +130,7 @@ class Stream:
 
     def _advance(self, actions: Actions, check: bool) -> Latent:
         """Predict the latent frame that the actions of one latent step lead to."""
-        wanted = [self._batch, self._world.codec.temporal_stride]
+        wanted = [len(self.given), self._world.codec.temporal_stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
         actions = self._world.normalise(self._world.checked(actions) if check else actions)
