@@ -48,6 +48,12 @@ def flattened(course: Tree) -> Tree:
     return tree_map(lambda values: values.flatten(0, 1), course)
 
 
+def as_vectors(course: Any) -> Tensor:
+    """A course as one vector for each frame, `[B, T, V]`."""
+    leaves = cast(list[Tensor], cast(Any, _pytree).tree_leaves(course))
+    return torch.cat([values.flatten(2).float() for values in leaves], 2)
+
+
 def declared_keypoints(places: Tensor) -> Keypoints:
     """Keypoints at places `[B, T, N, 2]` of declared things, which all count alike."""
     weights = places.new_full(places.shape[2:], DECLARED_WEIGHT)

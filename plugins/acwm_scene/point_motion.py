@@ -70,12 +70,15 @@ class PointMotion(nn.Module):
         features: number of features F of each.
         width: size of the embedded actions.
         noise: numbers of a draw that the motion depends on; 0 for one future.
+        declared: numbers that tell what declared things do in a latent frame.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, points: int, features: int, width: int, noise: int = 0) -> None:
+    def __init__(
+        self, points: int, features: int, width: int, noise: int = 0, declared: int = 0
+    ) -> None:
         super().__init__()
         self.points, entries = points, 2 + features
         size = points * entries
@@ -83,6 +86,11 @@ class PointMotion(nn.Module):
         self.register_buffer("std", torch.ones(points, entries))
         self.actions = nn.Linear(width, ACTION)
         self.chance = nn.Linear(noise, ACTION, bias=False) if noise else None
+        self.beside = (
+            nn.Sequential(nn.Linear(declared, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, ACTION))
+            if declared
+            else None
+        )
         self.core, self.start = nn.Linear(size, CORE), nn.Linear(2 * size, HIDDEN)
         self.gru = nn.GRUCell(ACTION + CORE, HIDDEN)
         self.change = nn.Sequential(

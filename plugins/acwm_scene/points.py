@@ -25,6 +25,9 @@ use for anything."""
 START_NOISE = 0.03
 """Noise on the points that motion is learned from, in standard deviations."""
 
+DECLARED_NOISE = 0.03
+"""Noise on what is declared that motion is learned beside: by then it is predicted, too."""
+
 WINDOWS = ((0.35, 2), (0.7, 5))
 """Until which share of the training motion is learned from windows of so many latent frames; then
 from whole clips, in which errors add up."""
@@ -48,6 +51,8 @@ class PointGroup(Group):
         channels: size of the grid that is drawn on.
         width: size of the conditioner's modulation.
         noise: numbers that a draw depends on; 0 for one future.
+        declared: numbers V that tell, in each video frame, how what the card declares is, such as
+            the joints of a robot; points move with regard to it.
     """
 
     weight: Tensor
@@ -61,13 +66,14 @@ class PointGroup(Group):
         channels: int,
         width: int,
         noise: int = 0,
+        declared: int = 0,
         **_: object,
     ) -> None:
         super().__init__()
         self.stride, self.noise, self.shape = stride, noise, (points, 2 + FEATURES)
         self.register_buffer("weight", torch.ones(self.shape))
         self.sight = PointSight(latent_channels, points, FEATURES)
-        self.motion = PointMotion(points, FEATURES, width, noise)
+        self.motion = PointMotion(points, FEATURES, width, noise, stride * declared)
         self.painter = PointPainter(points, FEATURES, channels=channels, width=width)
 
     @property
@@ -124,6 +130,22 @@ class PointGroup(Group):
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by latent frames; see `PointMotion.embed`."""
         return self.motion.embed(modulation)
+
+    def beside(self, actions: Tensor, declared: Tensor) -> Tensor:
+        """Embedded actions that also tell what declared things do meanwhile.
+
+        Args:
+            actions: by latent frames, `[B, L, ACTION]`.
+            declared: the course of declared things in the video frames of the last of these latent
+                frames, `[B, stride · N, V]`; as in a clip, whose first frame nothing leads to.
+
+        Returns:
+            `[B, L, ACTION]`.
+        """
+        assert self.motion.beside is not None
+        vectors = declared.unflatten(1, (-1, self.stride)).flatten(2)
+        embedded = self.motion.beside(vectors)
+        return actions + functional.pad(embedded, (0, 0, actions.shape[1] - embedded.shape[1], 0))
 
     def move(self, state: Points, actions: Tensor) -> tuple[Points, Tensor]:
         """The points one latent frame later, in which they do not move; see `Group.move`."""

@@ -24,10 +24,18 @@ from acwm_core.model.dynamics import (
 from acwm_core.model.shapes import Latent
 from acwm_scene.bodies import BodyGroup
 from acwm_scene.declared import GroupSpec, default_states, groups_of
-from acwm_scene.group import Group, at_frame, flattened, picked, stacked, tree_map
+from acwm_scene.group import (
+    Group,
+    as_vectors,
+    at_frame,
+    flattened,
+    picked,
+    stacked,
+    tree_map,
+)
 from acwm_scene.layers import FrameDrawing, MatrixConv
 from acwm_scene.node_group import NodeGroup
-from acwm_scene.points import PointGroup
+from acwm_scene.points import DECLARED_NOISE, PointGroup
 from acwm_scene.upgrade import upgraded
 from acwm_scene.values import ValueGroup
 
@@ -132,7 +140,11 @@ class SceneDynamics(Predictor):
         groups = {name: GROUPS[spec.kind](spec, **sizes, **options) for name, spec in specs.items()}
         self.point_size = 0
         if points:
-            groups["points"] = group = PointGroup(points, **sizes)
+            recorded = {name: torch.zeros(1, 1, len(spec.columns)) for name, spec in specs.items()}
+            seen = sum(
+                as_vectors(groups[name].encode(zeros)).shape[2] for name, zeros in recorded.items()
+            )
+            groups["points"] = group = PointGroup(points, declared=seen, **sizes)
             self.point_size = group.size
             self.columns["points"] = [*range(state_size, state_size + group.size)]
         self.groups = nn.Module()  # a ModuleDict has an attribute `values` of its own
@@ -204,11 +216,17 @@ class SceneDynamics(Predictor):
     def move_states(
         self, states: Mapping[str, Any], actions: Mapping[str, Tensor]
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The states of each group one latent frame later, and their courses; see `move`."""
+        """The states of each group one latent frame later, and their courses; see `move`.
+
+        Points come last, and move with regard to what is declared.
+        """
         moved, courses = dict[str, Any](), dict[str, Any]()
         with torch.autocast(next(iter(actions.values())).device.type, enabled=False):
             for name, group in self._groups():
-                moved[name], courses[name] = group.move(states[name], actions[name])
+                action = actions[name]
+                if isinstance(group, PointGroup) and courses:
+                    action = group.beside(action[:, None], _vectors(courses))[:, 0]
+                moved[name], courses[name] = group.move(states[name], action)
         return moved, courses
 
     def draw(self, scene: Scene, shown: Mapping[str, Any]) -> Tensor:
@@ -445,7 +463,13 @@ class SceneDynamics(Predictor):
         self, states: Tensor, conditioning: Conditioning, random: Generator, *, progress: float
     ) -> Tensor:
         """The error of how actions move things, without pictures, a scalar; see `Group`."""
-        actions = self.embed(conditioning)
+        actions, declared = self.embed(conditioning), self.encode(states)
+        declared.pop("points", None)
+        if self.points and declared:
+            later = _vectors(declared)[:, 1:]
+            noise = to_device(torch.randn(later.shape, generator=random), later)
+            later = later + DECLARED_NOISE * noise
+            actions["points"] = self.points.beside(actions["points"], later)
         losses = [
             group.motion_loss(
                 states[..., self.columns[name]].float(), actions[name], random, progress
@@ -583,6 +607,11 @@ class SceneDynamics(Predictor):
             for (name, group), part in zip(self._groups(), parts, strict=True)
         }
         return scene._replace(states=states)
+
+
+def _vectors(courses: Mapping[str, Any]) -> Tensor:
+    """The courses of several groups as vectors `[B, T, V]`."""
+    return torch.cat([as_vectors(course) for course in courses.values()], 2)
 
 
 class _SceneStream(LatentStream):

@@ -150,3 +150,25 @@ def test_a_scene_with_points_conforms(noise):
 def test_a_scene_of_nothing_is_refused():
     with pytest.raises(RecipeError, match=r"model.points=16"):
         SceneDynamics(latent_channels=3, specs={}, state_size=0)
+
+
+@pytest.mark.ci
+def test_points_move_with_regard_to_what_is_declared():
+    """A declared value alone decides where the point goes; the actions do not tell."""
+    torch.manual_seed(0)
+    declared = {"values": GroupSpec("values", columns=(0,))}
+    model = model_of_balls(specs=declared, state_size=1, points=1)
+    model.prepare(torch.zeros(1), torch.ones(1))
+    values = torch.cumsum(torch.randn(128, FRAMES, 1) * 0.3, 1)
+    place = torch.zeros(128, FRAMES, 6)
+    place[..., 0] = 0.5 * (values - values[:, :1])[..., 0]
+    model.points.measure(place.flatten(0, 1)[:, None], torch.ones(1, 6))
+    world, states = world_of(model, stride=1, states=7), torch.cat([values, place], 2)
+    learn_motion(world, states, torch.zeros(128, FRAMES, 2), steps=80, clips=32)
+    actions = model.points.embed(torch.zeros(128, FRAMES, SMALL["width"]))
+    beside = model.points.beside(actions, model.encode(states)["values"][:, 1:])
+    state = model.points.begin(place[:, :1], place[:, :1])
+    for frame in range(1, FRAMES):
+        state, _ = model.points.move(state, beside[:, frame])
+    error = (state.points[:, 0, 0] - place[:, -1, 0]).square().mean()
+    assert error < 0.3 * place[:, -1, 0].square().mean()
