@@ -13,11 +13,8 @@ from acwm_scene.poses import waves, waves_size
 ACTION = 32
 """Values that tell of the actions of a latent frame."""
 
-HIDDEN = 96
-"""Size of what moves the core, and of its layers: 256 overfitted on 272 episodes."""
-
-CORE = 32
-"""Numbers that actions move, and that points may follow."""
+PHASES, HIDDEN = 16, 96
+"""Phases that actions move and points follow, and the size of the layers that move them."""
 
 IDENTITY, MEMORY, CHANNELS, OCTAVES = 16, 48, 32, 3
 """Of the interaction of points: numbers that tell one point from another, the size of what each
@@ -37,10 +34,9 @@ class Points(NamedTuple):
         points: where they are and what they look like, `[B, K, 2 + F]`.
         given: the same in the given frame.
         scene: what is to be known of the given frame, `[B, HIDDEN]`.
-        led: where the core leads the points from the given frame, before it has moved,
-            `[B, K, 2 + F]`.
-        core: the numbers that actions move, `[B, CORE]`.
-        hidden: what moves them, `[B, HIDDEN]`.
+        led: where the phases of the given frame lead the points, `[B, K, 2 + F]`.
+        phases: the numbers that actions move, in rad, `[B, PHASES]`.
+        rates: how far they move in a latent frame, `[B, PHASES]`.
         pushed: how far interactions have moved each point, `[B, K, 2 + F]`.
         memory: of each point, `[B, K, MEMORY]`.
         chance: numbers that this future depends on, `[B, noise]`, of a model that draws.
@@ -50,8 +46,8 @@ class Points(NamedTuple):
     given: Tensor
     scene: Tensor
     led: Tensor
-    core: Tensor
-    hidden: Tensor
+    phases: Tensor
+    rates: Tensor
     pushed: Tensor
     memory: Tensor
     chance: tuple[Tensor, ...] = ()
@@ -60,10 +56,11 @@ class Points(NamedTuple):
 class PointMotion(nn.Module):
     """Two ways in which points move, which are added.
 
-    Actions move a few numbers, the core, and points follow these and the given frame: so errors of
-    points that belong together, as those of one arm do, do not add up one by one. And each point
-    gets messages from all others, as in an interaction network (Battaglia et al. 2016, arXiv
-    1612.00222): so things are pushed.
+    Actions accelerate a few phases, and points follow these and the given frame: so errors of
+    points that belong together, as those of one arm do, do not add up one by one. Phases wrap, as
+    the angles of joints do, and have a rate, as what has mass does. And each point gets messages
+    from all others, as in an interaction network (Battaglia et al. 2016, arXiv 1612.00222): so
+    things are pushed.
 
     Args:
         points: number of points K.
@@ -91,14 +88,20 @@ class PointMotion(nn.Module):
             if declared
             else None
         )
-        self.core, self.start = nn.Linear(size, CORE), nn.Linear(2 * size, HIDDEN)
-        self.gru = nn.GRUCell(ACTION + CORE, HIDDEN)
-        self.change = nn.Sequential(
-            nn.Linear(HIDDEN + ACTION + CORE, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, CORE)
+        self.phases = nn.Sequential(
+            nn.Linear(size, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 2 * PHASES)
         )
-        self.by_core, self.by_scene = nn.Linear(CORE, HIDDEN), nn.Linear(size, HIDDEN)
+        self.rates = nn.Linear(2 * size, PHASES)
+        self.accelerate = nn.Sequential(
+            nn.Linear(3 * PHASES + ACTION, HIDDEN),
+            nn.SiLU(),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.SiLU(),
+            nn.Linear(HIDDEN, 2 * PHASES),
+        )
+        self.by_phases, self.by_scene = nn.Linear(2 * PHASES, HIDDEN), nn.Linear(size, HIDDEN)
         self.follow = nn.Sequential(
-            nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, size)
+            nn.Linear(2 * HIDDEN, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, size)
         )
         self.identity = nn.Parameter(torch.randn(points, IDENTITY))
         own = IDENTITY + entries
@@ -121,16 +124,17 @@ class PointMotion(nn.Module):
     def begin(self, points: Tensor, change: Tensor) -> Points:
         """The state of points `[B, K, 2 + F]` that changed so since the latent frame before."""
         values = ((points - self.mean) / self.std).flatten(1)
-        core, scene = self.core(values), self.by_scene(values)
+        sines, cosines = self.phases(values).chunk(2, 1)
+        phases, scene = torch.atan2(sines, cosines), functional.silu(self.by_scene(values))
         change = change / self.std
         memory = torch.tanh(self.remember(torch.cat([self._own(points), change], -1)))
         return Points(
             points,
             given=points,
             scene=scene,
-            led=self._led(core, scene),
-            core=core,
-            hidden=torch.tanh(self.start(torch.cat([values, change.flatten(1)], 1))),
+            led=self._led(phases, scene),
+            phases=phases,
+            rates=self.rates(torch.cat([values, change.flatten(1)], 1)),
             pushed=torch.zeros_like(points),
             memory=memory,
         )
@@ -139,22 +143,23 @@ class PointMotion(nn.Module):
         """The state one latent frame later, by embedded actions `[B, ACTION]`."""
         if self.chance:
             action = action + self.chance(*state.chance)
-        inputs = torch.cat([action, state.core], -1)
-        hidden = self.gru(inputs, state.hidden)
-        core = state.core + STEP * self.change(torch.cat([hidden, inputs], -1))
+        inputs = [state.phases.cos(), state.phases.sin(), state.rates, action]
+        faster, further = (STEP * self.accelerate(torch.cat(inputs, 1))).chunk(2, 1)
+        phases = state.phases + state.rates + further
         push, memory = self._pushed(state.points, state.memory, action)
         pushed = state.pushed + STEP * push
-        led = self._led(core, state.scene) - state.led
+        led = self._led(phases, state.scene) - state.led
         return state._replace(
             points=state.given + led + pushed,
-            core=core,
-            hidden=hidden,
+            phases=phases,
+            rates=state.rates + faster,
             pushed=pushed,
             memory=memory,
         )
 
-    def _led(self, core: Tensor, scene: Tensor) -> Tensor:
-        return self.follow(self.by_core(core) + scene).view(-1, *self.std.shape) * self.std
+    def _led(self, phases: Tensor, scene: Tensor) -> Tensor:
+        moved = functional.silu(self.by_phases(torch.cat([phases.cos(), phases.sin()], 1)))
+        return self.follow(torch.cat([moved, scene], 1)).view(-1, *self.std.shape) * self.std
 
     def _own(self, points: Tensor) -> Tensor:
         return torch.cat([self.identity.expand(len(points), -1, -1), points], -1)
