@@ -64,6 +64,13 @@ def register_formats_of_arrays(registry: Registry) -> None:
         requires=("minari", "h5py"),
     )
     registry.add(
+        "rlds",
+        "acwm_formats.rlds:RLDS",
+        summary="RLDS datasets of TensorFlow Datasets, as Open X-Embodiment; read only",
+        extra="rlds",
+        requires=("google_crc32c", "google.protobuf"),
+    )
+    registry.add(
         "mcap",
         "acwm_formats.mcap_logs:MCAP",
         summary="logs with images or video and a topic of numbers; read only",

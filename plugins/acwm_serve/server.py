@@ -8,13 +8,13 @@ import hmac
 import ipaddress
 import signal
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
 import click
 import numpy as np
-from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from acwm_core.errors import AcwmError, DataError, RecipeError, sentence
 from acwm_serve.batcher import Batcher
@@ -138,15 +138,7 @@ class Server:
         """Answer one client until it leaves."""
         await socket.send_bytes(packed(self._engine.facts()))
         running: Running | None = None
-        while True:
-            try:
-                message = await socket.receive(timeout=self._limits.idle)
-            except TimeoutError:
-                reason = f"no message for {self._limits.idle:g} s".encode()
-                await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=reason)
-                return
-            if message.type not in (WSMsgType.BINARY, WSMsgType.TEXT):
-                return
+        async for message in self._messages(socket):
             began = time.monotonic()
             try:
                 running, answer = await self._answer(message.data, running)
@@ -157,6 +149,29 @@ class Server:
             self._metrics.frames.inc(len(answer["frames"]))
             self._metrics.latency.observe(time.monotonic() - began)
             await socket.send_bytes(packed(answer))
+
+    async def _messages(self, socket: web.WebSocketResponse) -> AsyncIterator[WSMessage]:
+        """A client's messages until it leaves or is idle.
+
+        The next one is waited for while one is answered: aiohttp answers pings only then.
+        """
+        receiving = asyncio.ensure_future(socket.receive())
+        try:
+            while True:
+                await asyncio.wait({receiving}, timeout=self._limits.idle)
+                if not receiving.done():
+                    reason = f"no message for {self._limits.idle:g} s".encode()
+                    receiving.cancel()
+                    await asyncio.gather(receiving, return_exceptions=True)
+                    await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=reason)
+                    return
+                message = receiving.result()
+                if message.type not in (WSMsgType.BINARY, WSMsgType.TEXT):
+                    return
+                receiving = asyncio.ensure_future(socket.receive())
+                yield message
+        finally:
+            receiving.cancel()
 
     async def _answer(self, data: Any, running: Running | None) -> tuple[Running, Answer]:
         """The video after a message, and what to send."""

@@ -236,6 +236,20 @@ def test_a_full_queue_and_a_slow_model_are_told(
         client.socket.close()
 
 
+def test_pings_are_answered_while_the_model_computes(served, exact, client_class, monkeypatch):
+    """Else a client would take a server that is busy for one that is gone."""
+    server, said = served(exact), []
+    with client_class(server.address, TOKEN) as client:
+        client.start(picture(2, SIZE))
+        go, waits = slowly(server, monkeypatch)
+        thread = asking(client, actions(4), said)
+        assert waits.wait(10)
+        assert client.socket.ping().wait(10)
+        go.set()
+        thread.join(30)
+    assert len(said) == 1
+
+
 def test_an_idle_session_ends(served, exact, client_class):
     server = served(exact, idle=0.2)
     refused = pytest.raises(ConnectionClosed, match=r"no message for 0\.2 s")
