@@ -73,10 +73,12 @@ class StateStream:
         named = self._world.named_states(self._states.current[:, None])
         return {name: values[:, 0] for name, values in named.items()}
 
-    @torch.inference_mode()
     @float32_by_default()
     def step(self, actions: Actions) -> dict[str, Tensor]:
         """The fields of the state in the video frames that a latent step leads to.
+
+        If the actions require a gradient, the fields have one, by all steps so far whose actions
+        did, until the scenes are `picked` under `torch.no_grad`.
 
         Args:
             actions: raw actions `[B, temporal_stride, A]`; the first acts on the last frame so far.
@@ -90,10 +92,11 @@ class StateStream:
         wanted = [len(self), self._stride]
         if actions.ndim != 3 or list(actions.shape[:2]) != wanted:
             raise ShapeError(f"a step takes actions {[*wanted, 'A']}, not {list(actions.shape)}")
-        rows = self._world.normalise(self._world.checked(actions))
-        self._recent = torch.cat([self._recent[:, 1:], rows[:, None]], 1)
-        self._known = (self._known + 1).clamp(max=self._most)
-        return self._world.named_states(self._states.advance(self._embed()))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and actions.requires_grad):
+            rows = self._world.normalise(self._world.checked(actions))
+            self._recent = torch.cat([self._recent[:, 1:], rows[:, None]], 1)
+            self._known = (self._known + 1).clamp(max=self._most)
+            return self._world.named_states(self._states.advance(self._embed()))
 
     def picked(self, rows: Tensor) -> StateStream:
         """A stream of some of the scenes, by their numbers `[N]`, each as often as it is named."""

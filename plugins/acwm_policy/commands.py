@@ -35,14 +35,13 @@ def policy() -> None:
     "--in",
     "place",
     type=click.Choice(["dream", "simulator"]),
-    default="dream",
-    help="Where the policy acts while it learns: in the model, or in the simulator.",
+    help="Where the policy acts while it learns: in the model (the default) or in the simulator.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(1),
-    default=200_000,
-    help="Steps of all scenes together; an action is held for a step, which is a latent frame.",
+    help="Steps of all scenes together, by default 200,000; an action is held for a step, which is "
+    "a latent frame.",
 )
 @click.option(
     "--scenes",
@@ -67,8 +66,8 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     """Train a policy at a task by acting in a model of its environment.
 
     MODEL is a run folder or a trained model; the trained model of the environment by default. It
-    must predict states. OVERRIDES choose what learns, and set its parameters by name:
-    algorithm=sac (or ppo, td3) learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
+    must predict states. OVERRIDES choose what learns (`acwm list learner`), and set its parameters
+    by name: algorithm=sac learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
     (fields of the state) and bonus=1 (reward for success). If it is interrupted, run the same
     command again to continue; with more --steps it trains on.
     """

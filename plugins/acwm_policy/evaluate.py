@@ -36,8 +36,8 @@ from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_planning.runner import EpisodeTable, play_missing
 from acwm_planning.table import EpisodeLine, summarise
+from acwm_policy.episodes import Episodes
 from acwm_policy.scenes import DreamScenes
-from acwm_policy.vector import TaskScenes
 
 EVALUATION, EVALUATION_FILE = "evaluation", "evaluation.json"
 """Folder of the results within a policy's folder, and the file with the summary."""
@@ -131,20 +131,19 @@ class EvaluatedEpisodes(EpisodeTable):
 def dream(policy: SavedPolicy, bundle: RunBundle, task: Task, start: DreamStart) -> dict[str, Any]:
     """The facts of an episode of the policy in the model, as those of one in the simulator."""
     scenes = DreamScenes(bundle.world_model, [start], 1)
-    vector = TaskScenes(scenes, task, bundle.card, policy.card.inputs, unit=1.0, bonus=0.0)
-    vectors, total, begun = vector.begin([0]), 0.0, vector.distances[0]
+    episodes = Episodes(scenes, task, bundle.card, policy.card.inputs, unit=1.0, bonus=0.0)
+    vectors = episodes.begin([0])
+    begun = float(episodes.distances[0])
     for _ in range(-(-task.max_steps // scenes.repeat)):
-        vector.step_async(policy.scaled(vectors))
-        vectors, rewards, over, infos = vector.step_wait()
-        total += float(rewards[0])
-        if over[0]:
-            facts = infos[0]
+        step = episodes.step(policy.scaled(vectors))
+        vectors = step.vectors
+        if step.over[0]:
             return {
-                "success": bool(facts["is_success"]),
-                "failed": bool(facts["failed"]),
-                "steps": int(facts["episode"]["l"]),
-                "start_distance": float(begun),
-                "distance": float(begun - total),
+                "success": bool(step.solved[0]),
+                "failed": bool(step.failed[0]),
+                "steps": int(step.frames[0]),
+                "start_distance": begun,
+                "distance": begun - float(step.returns[0]),
             }
     raise RecipeError(f"the task {task.name!r} does not end")
 

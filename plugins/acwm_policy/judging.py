@@ -13,6 +13,9 @@ from acwm_core.errors import RecipeError
 from acwm_planning.predicted import NotPredicted, observation_of
 from acwm_policy.scenes import States
 
+DIFFERENCE = 1e-3
+"""By how much values are changed to see how a task's distance changes, in their units."""
+
 
 class Watched(Mapping[str, Any]):
     """Fields that remember which of them were asked for (`asked`)."""
@@ -70,6 +73,7 @@ class Judgement(NamedTuple):
     distance: NDArray[np.float64]  # `[n]`, in the last frame that counts; the one before if unknown
     success: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # in this step or before
+    frame: NDArray[np.int64]  # `[n]`, the frame of the step that has the distance; -1 if none has
 
 
 def judge(
@@ -91,6 +95,7 @@ def judge(
         frames: for each scene, how many of the frames lie within the task's time, at least 1.
     """
     distance, success, after = before.copy(), np.zeros(len(goals), np.bool_), failed.copy()
+    frame = np.full(len(goals), -1)
     for row, goal in enumerate(goals):
         count = int(frames[row])
         seen = observation_of({name: v[row, :count] for name, v in states.items()}, count)
@@ -100,6 +105,40 @@ def judge(
         after[row] = failed[row] or bool(failures.any())
         success[row] = bool(solved.any()) and not failed[row]
         last = int(solved.argmax()) + 1 if success[row] else count
-        known = distances[:last][np.isfinite(distances[:last])]
-        distance[row] = known[-1] if len(known) else before[row]
-    return Judgement(distance, success, after)
+        known = np.flatnonzero(np.isfinite(distances[:last]))
+        if len(known):
+            frame[row] = known[-1]
+            distance[row] = distances[known[-1]]
+    return Judgement(distance, success, after, frame)
+
+
+def slopes(
+    task: Task, states: States, goals: Sequence[Goal], names: Sequence[str]
+) -> dict[str, NDArray[np.float64]]:
+    """How the task's distance changes with the values of a scene, `[n, …]` for each field.
+
+    A task's distance is a program of NumPy, which knows no gradients. These are central differences
+    with steps of `DIFFERENCE` units. They are 0 where a distance is unknown or jumps.
+
+    Args:
+        task: the task.
+        states: of n scenes, `[n, …]`.
+        goals: of the scenes.
+        names: the fields; see `needs_of`.
+    """
+    fields = {name: np.asarray(states[name], np.float64) for name in names}
+    found = {name: np.zeros(values.shape) for name, values in fields.items()}
+    for row, goal in enumerate(goals):
+        sizes = {name: values[row].size for name, values in fields.items()}
+        count, place, tried = 2 * sum(sizes.values()), 0, dict[str, NDArray[Any]]()
+        for name, size in sizes.items():
+            values = np.repeat(fields[name][row].reshape(1, -1), count, 0)
+            values[range(place, place + size), range(size)] += DIFFERENCE
+            values[range(count // 2 + place, count // 2 + place + size), range(size)] -= DIFFERENCE
+            tried[name], place = values.reshape(count, *fields[name].shape[1:]), place + size
+        distances = judged(task, "distance", observation_of(tried, count), goal)
+        slope = (distances[: count // 2] - distances[count // 2 :]) / (2 * DIFFERENCE)
+        parts = np.split(np.nan_to_num(slope, posinf=0.0, neginf=0.0), np.cumsum([*sizes.values()]))
+        for name, part in zip(sizes, parts, strict=False):
+            found[name][row] = part.reshape(found[name].shape[1:])
+    return found

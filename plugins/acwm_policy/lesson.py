@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,32 +25,53 @@ from acwm_core.training.run import RunBundle
 from acwm_dream.starts import DatasetStarts, DreamStart, SimulatorStarts
 from acwm_planning.episode import load_task
 from acwm_planning.policies.saved import PolicyInputs, side_by_side
+from acwm_policy.episodes import Episodes
 from acwm_policy.judging import judge, needs_of
 from acwm_policy.scenes import DreamScenes, Scenes, SimulatorScenes, States
 
-Place = Literal["dream", "simulator"]
-"""Where a policy acts."""
+Place = Literal["dream", "simulator", "recordings"]
+"""What a policy learns from: acting in a model or in the simulator, or recorded actions."""
 
 MEASURED = 256
 """Fewest random steps from which the scale of observations is measured."""
 
 
-class Lesson(NamedTuple):
-    """What a policy learns from.
+class Measured(NamedTuple):
+    """What a policy observes, and the scale of it all.
 
     Attributes:
-        card: card of the environment.
-        task: the task.
-        scenes: where it acts.
         inputs: what it observes.
         unit: mean distance of the starts, which is worth a reward of 1.
     """
 
-    card: EnvironmentCard
-    task: Task
-    scenes: Scenes
     inputs: PolicyInputs
     unit: float
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a policy learns from.
+
+    Attributes:
+        card: card of the environment.
+        task: name of the task; empty for a policy without one.
+        repeat: number of actions for which each action of the policy is held.
+        place: what it learns from.
+        measured: what is observed, and its scale.
+        source: episodes to act in, or recordings.
+    """
+
+    card: EnvironmentCard
+    task: str
+    repeat: int
+    place: Place
+    measured: Measured
+    source: Episodes
+
+    @property
+    def episodes(self) -> Episodes:
+        """Episodes to act in, side by side."""
+        return self.source
 
 
 class Beginnings(NamedTuple):
@@ -137,7 +159,9 @@ def prepare(
     place: Place,
     number: int,
     observe: Sequence[str] | None = None,
+    bonus: float = 1.0,
     seed: int = 0,
+    measured: Measured | None = None,
 ) -> Lesson:
     """The scenes of a task, and what a policy observes in them.
 
@@ -148,7 +172,10 @@ def prepare(
         place: in the dream of the model, or in the simulator.
         number: number of scenes.
         observe: names of the fields of the state to observe; see `PolicySettings`.
-        seed: of the random steps that measure the scale of observations.
+        bonus: reward for success.
+        seed: of the starts that are drawn, and of the random steps that measure the scale of
+            observations.
+        measured: what these steps have measured before; None to measure.
     """
     card, world = bundle.card, bundle.world_model
     shapes = {name: [*shape] for name, shape in world.state_shapes.items()}
@@ -162,11 +189,16 @@ def prepare(
         raise RecipeError(f"{type(world.model).__name__} learns no states, so none can be observed")
     first, _ = scenes.begin([0], [0])
     needs = needs_of(task, {name: first[name] for name in shapes}, goals[0])
-    chosen = chosen_fields(world, card, needs.state, observe)
-    state = {name: shapes[name] for name in chosen}
-    aims = {name: [*np.shape(goals[0].state[name])] for name in needs.goal}
-    inputs = measure(scenes, card, task, state, aims, goals, seed)
-    return Lesson(card, task, scenes, inputs, usual_distance(scenes, task, goals))
+    if measured is None:
+        chosen = chosen_fields(world, card, needs.state, observe)
+        state = {name: shapes[name] for name in chosen}
+        aims = {name: [*np.shape(goals[0].state[name])] for name in needs.goal}
+        inputs = measure(scenes, card, task, state, aims, goals, seed)
+        measured = Measured(inputs, usual_distance(scenes, task, goals))
+    inputs, unit = measured
+    options = {"unit": unit, "bonus": bonus, "watched": needs.state, "seed": seed}
+    episodes = Episodes(scenes, task, card, inputs, **options)
+    return Lesson(card, task.name, scenes.repeat, place, measured, episodes)
 
 
 def chosen_fields(
@@ -207,11 +239,11 @@ def measure(
     states, changes = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
     for _ in range(max(1, MEASURED // (scenes.number * length))):
         begun = rng.integers(scenes.starts, size=scenes.number).tolist()
-        now = side_by_side(scenes.begin(range(scenes.number), begun)[0], state)
+        now = side_by_side(scenes.begin(range(scenes.number), begun)[0], state).numpy()
         for _ in range(length):
             shape = scenes.number, card.action.size
             actions = rng.uniform(low, high, shape).astype(np.float32).clip(low, high)
-            later = side_by_side(_last(scenes.step(actions.astype(np.float32))), state)
+            later = side_by_side(_last(scenes.step(actions)), state).numpy()
             states.append(later)
             changes.append(later - now)
             now = later
@@ -224,9 +256,8 @@ def measure(
         if name in of_state and state[name] == shape:  # alike are scaled alike
             more = mean[of_state[name]], std[of_state[name]]
         else:
-            more = _scale(
-                side_by_side({name: np.stack([g.state[name] for g in goals])}, {name: shape})
-            )
+            values = np.stack([goal.state[name] for goal in goals])
+            more = _scale(values.reshape(len(goals), -1).astype(np.float64))
         mean, std = np.concatenate([mean, more[0]]), np.concatenate([std, more[1]])
     return PolicyInputs(dict(state), dict(aims), mean.tolist(), std.tolist(), change.tolist())
 

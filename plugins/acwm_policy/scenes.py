@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
@@ -61,6 +62,14 @@ class Scenes(ABC):
     def step(self, actions: NDArray[np.float32]) -> States:
         """Hold raw actions `[n, A]` for a step; the states in its video frames `[n, repeat, …]`."""
 
+    def move(self, actions: Tensor) -> dict[str, Tensor]:
+        """As `step`, of tensors; in a dream, differentiable with respect to the actions."""
+        states = self.step(actions.detach().numpy())
+        return {name: torch.as_tensor(values) for name, values in states.items()}
+
+    def detach(self) -> None:  # noqa: B027 (most have no gradients)
+        """Forget the gradients of the steps so far."""
+
     def close(self) -> None:  # noqa: B027 (most hold nothing)
         """Free all resources."""
 
@@ -81,7 +90,8 @@ class DreamScenes(Scenes):
 
     def __init__(self, world: WorldModel, starts: Sequence[DreamStart], number: int) -> None:
         super().__init__(number)
-        self._world, self.starts, self.repeat = world, len(starts), world.codec.temporal_stride
+        self._world = world.requires_grad_(False)
+        self.starts, self.repeat = len(starts), world.codec.temporal_stride
         self._goals = [start.goal for start in starts]
         self._read = self._read_starts(starts)
         self._scenes = self._read.picked(torch.zeros(number, dtype=torch.int64))
@@ -93,9 +103,17 @@ class DreamScenes(Scenes):
         return as_arrays(begun.current), [goal for goal in goals if goal is not None]
 
     def step(self, actions: NDArray[np.float32]) -> States:
-        rows = torch.from_numpy(actions).to(self._world.device)
+        return as_arrays(self.move(torch.from_numpy(actions)))
+
+    def move(self, actions: Tensor) -> dict[str, Tensor]:
+        rows = actions.to(self._world.device)[:, None].expand(-1, self.repeat, -1)
         with noting("while the model moves the scenes", *self._world.children()):
-            return as_arrays(self._scenes.step(rows[:, None].expand(-1, self.repeat, -1)))
+            states = self._scenes.step(rows)
+        return {name: values.cpu() for name, values in states.items()}
+
+    @torch.no_grad()
+    def detach(self) -> None:
+        self._scenes = self._scenes.picked(torch.arange(self.number))
 
     def _read_starts(self, starts: Sequence[DreamStart]) -> StateStream:
         whole: StateStream | None = None
@@ -168,6 +186,6 @@ def stacked(states: Sequence[States]) -> States:
     return {name: np.stack([np.asarray(each[name]) for each in states]) for name in states[0]}
 
 
-def as_arrays(states: Mapping[str, torch.Tensor]) -> States:
+def as_arrays(states: Mapping[str, Tensor]) -> States:
     """States in NumPy, on the CPU."""
-    return {name: values.cpu().numpy() for name, values in states.items()}
+    return {name: values.detach().cpu().numpy() for name, values in states.items()}

@@ -2,44 +2,46 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+import torch
 
 from acwm_core.data.shards import file_sha256
-from acwm_core.errors import DataError
+from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.executors import progress_bar
-from acwm_core.files import held, read_json, writing, written_whole
+from acwm_core.files import held, load_plain, read_json, writing, written_whole
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.threads import use_threads
-from acwm_planning.policies.saved import PolicyCard, PolicyInputs, SavedPolicy
-from acwm_policy.learner import (
-    load_checkpoint,
-    make_learner,
-    network_in,
-    restore,
-    save_checkpoint,
-)
-from acwm_policy.lesson import Lesson, Place, beginnings, find_task, prepare
-from acwm_policy.settings import PolicySettings
-from acwm_policy.vector import TaskScenes
+from acwm_planning.policies.saved import PolicyCard, PolicyInputs, SavedPolicy, layers_of
+from acwm_policy.learner import Learner
+from acwm_policy.lesson import Lesson, Measured, Place, beginnings, find_task, prepare
+from acwm_policy.settings import PolicySettings, learner_class
 
 SETTINGS_FILE, CHECKPOINT, CURVE = "settings.json", "checkpoint.pt", "curve.csv"
 """Files in a policy's folder, beside the policy."""
 
 CHECKPOINTS = 20
-"""How many checkpoints a training writes, at equal distances."""
+"""Most stages of a training; each ends with a checkpoint."""
+
+VERSION = 1
+"""Of the contents of a checkpoint."""
+
+PLACES: Mapping[Place, str] = {
+    "dream": "in the dream",
+    "simulator": "in the simulator",
+}
+"""Phrases for where a policy learns."""
 
 COLUMNS = ("steps", "success", "return", "cpu_seconds")
 """Columns of the curve: steps of all scenes together, success and return of the last episodes where
@@ -52,8 +54,8 @@ def train_policy(
     *,
     settings: PolicySettings,
     out: Path,
-    place: Place = "dream",
-    steps: int = 200_000,
+    place: Place | None = None,
+    steps: int | None = None,
     scenes: int | None = None,
     starts: int = 256,
     data: Path | None = None,
@@ -68,8 +70,10 @@ def train_policy(
         task: name of a task of its environment, alone or after the environment's and a dot.
         settings: the algorithm and its parameters.
         out: the policy's folder.
-        place: whether to act in the dream of the model or in the simulator.
-        steps: steps of all scenes together; a step holds an action for one latent frame.
+        place: whether to act in the dream of the model or in the simulator; by default the
+            learner's first.
+        steps: steps of all scenes together; a step holds an action for one latent frame. By
+            default the learner's.
         scenes: number of scenes side by side; by default 64 in the dream and 1 in the simulator.
         starts: number of training episodes whose starts are used.
         data: dataset to take the starts from instead of the simulator.
@@ -81,6 +85,12 @@ def train_policy(
         DataError: `out` holds a policy that was trained otherwise.
         RecipeError: the model predicts too little for the task, or a parameter is wrong.
     """
+    kind = learner_class(settings.algorithm)
+    place = kind.places[0] if place is None else place
+    if place not in kind.places:
+        known = " or ".join(PLACES[each] for each in kind.places)
+        raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
+    steps = kind.usual_steps if steps is None else steps
     number = scenes or (64 if place == "dream" else 1)
     bundle, weights = load_run(run), RunFolder(find_run(run)).weights
     goal_task = find_task(task, bundle.card)
@@ -99,10 +109,17 @@ def train_policy(
     with _opened(out, about):
         use_threads(None, None, choose=True)
         bundle.world_model.to(choose_device(device))
+        stored = load_checkpoint(out / CHECKPOINT)
         begun = beginnings(bundle, goal_task, starts, data, place)
-        lesson = prepare(bundle, goal_task, begun, place, number, settings.observe, seed)
-        with closing(lesson.scenes):
-            return _learn(lesson, settings, about, out, steps, seed, progress)
+        lesson = prepare(
+            *(bundle, goal_task, begun, place, number),
+            observe=settings.observe,
+            bonus=settings.bonus,
+            seed=seed,
+            measured=None if stored is None else measured_in(stored),
+        )
+        with closing(lesson.source):
+            return _learn(lesson, settings, about, out, steps, stored, progress)
 
 
 def _opened(out: Path, about: Mapping[str, Any]) -> Any:
@@ -134,112 +151,105 @@ def _learn(
     about: Mapping[str, Any],
     out: Path,
     steps: int,
-    seed: int,
+    stored: Mapping[str, Any] | None,
     progress: bool,
 ) -> SavedPolicy:
-    path = out / CHECKPOINT
-    whole = load_checkpoint(path) if path.exists() else None
-    if whole is not None:
-        lesson = lesson._replace(inputs=PolicyInputs(**whole["inputs"]), unit=whole["unit"])
-    vector = TaskScenes(
-        lesson.scenes,
-        lesson.task,
-        lesson.card,
-        lesson.inputs,
-        unit=lesson.unit,
-        bonus=settings.bonus,
-        seed=seed,
+    learner = settings.learner()
+    learner.begin(lesson, about["seed"])
+    keeper = _Keeper(learner, lesson, about, out)
+    if stored is not None:
+        keeper.restore(stored)
+    shown = progress_bar(
+        f"{about['algorithm']} at {lesson.task} {PLACES[lesson.place]}",
+        steps,
+        unit="steps",
+        done=learner.steps,
+        shown=progress and learner.steps < steps,
+        note=keeper.note,
     )
-    learner = make_learner(settings, vector, seed)
-    keeper = _Keeper(lesson, vector, about, out, steps)
-    if whole is not None:
-        restore(learner, vector, whole)
-        keeper.rows, keeper.seconds = [*whole["curve"]], whole["seconds"]
-    left, label = steps - learner.num_timesteps, f"{about['algorithm']} at {lesson.task.name}"
-    if left > 0:
-        shown = progress_bar(
-            f"{label} in the {about['place']}",
-            steps,
-            unit="steps",
-            done=learner.num_timesteps,
-            shown=progress,
-            note=keeper.note,
-        )
-        with shown as keeper.report:
-            learner.learn(left, callback=keeper, reset_num_timesteps=False)
-        keeper.save()
+    every = max(lesson.source.shortest, steps // CHECKPOINTS)
+    with shown as report:
+        while learner.steps < steps:
+            learner.learn(min(steps, (learner.steps // every + 1) * every), report)
+            keeper.save()
     return SavedPolicy.read(out)
 
 
-class _Keeper(BaseCallback):
-    """Writes checkpoints, the policy and its curve while it learns, and reports progress."""
+class _Keeper:
+    """Writes checkpoints, the policy and its curve between the stages of learning."""
 
     def __init__(
-        self, lesson: Lesson, scenes: TaskScenes, about: Mapping[str, Any], out: Path, steps: int
+        self, learner: Learner, lesson: Lesson, about: Mapping[str, Any], out: Path
     ) -> None:
-        super().__init__()
-        self._lesson, self._scenes, self._about, self._out = lesson, scenes, about, out
-        self._every, self._began = max(1, steps // CHECKPOINTS), time.process_time()
-        self._reported = self._saved = 0
-        self.rows: list[list[float | None]] = []
-        self.seconds = 0.0
-        self.report: Callable[[int], object] = lambda _: None
-
-    def _on_training_start(self) -> None:
-        self._reported = self._saved = self.num_timesteps = self.model.num_timesteps
-        self._began = time.process_time()
-
-    def _on_step(self) -> bool:
-        self.report(self.num_timesteps - self._reported)
-        self._reported = self.num_timesteps
-        if self.num_timesteps - self._saved >= self._every:
-            self.save()
-        return True
+        self._learner, self._lesson, self._about, self._out = learner, lesson, about, out
+        self._began, self._seconds = time.process_time(), 0.0
+        self._rows: list[list[float | None]] = []
 
     def note(self) -> str:
-        """How many of the last episodes succeeded."""
-        success = self._mean(self.model.ep_success_buffer) if hasattr(self, "model") else None
-        return "" if success is None else f"{success:.0%} solved"
+        """How the policy does where it learns."""
+        return self._lesson.source.note()
+
+    def restore(self, stored: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self._learner.restore(stored["learner"])
+        self._lesson.source.restore(stored["source"])
+        self._rows, self._seconds = [*stored["curve"]], stored["seconds"]
 
     def save(self) -> None:
         """Write everything; a killed command goes on from here."""
-        self._saved = self.num_timesteps
         now = time.process_time()
-        self.seconds, self._began = self.seconds + now - self._began, now
-        returns = [each["r"] for each in self.model.ep_info_buffer or ()]
-        success = self._mean(self.model.ep_success_buffer)
-        self.rows = [row for row in self.rows if row[0] != self.num_timesteps]
-        self.rows.append([self.num_timesteps, success, self._mean(returns), round(self.seconds, 1)])
-        save_checkpoint(
-            self._out / CHECKPOINT,
-            self.model,
-            self._scenes,
-            inputs=asdict(self._lesson.inputs),
-            unit=self._lesson.unit,
-            curve=self.rows,
-            seconds=self.seconds,
-        )
+        self._seconds, self._began = self._seconds + now - self._began, now
+        score = self._lesson.source.score()
+        self._rows.append([self._learner.steps, *score, round(self._seconds, 1)])
         self._policy().save(self._out)
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self.rows])
+        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self._rows])
         with written_whole(self._out / CURVE) as partial:
             partial.write_text(text.getvalue(), encoding="utf-8")
+        inputs, unit = self._lesson.measured
+        whole = {
+            "version": VERSION,
+            "learner": self._learner.state(),
+            "source": self._lesson.source.state(),
+            "inputs": asdict(inputs),
+            "unit": unit,
+            "curve": self._rows,
+            "seconds": self._seconds,
+        }
+        with written_whole(self._out / CHECKPOINT) as partial:
+            torch.save(whole, partial)
 
     def _policy(self) -> SavedPolicy:
-        card, (layers, network) = self._lesson.card, network_in(self.model)
-        facts = {"steps": self.num_timesteps, "cpu_seconds": round(self.seconds, 1)}
+        lesson, card = self._lesson, self._lesson.card
+        network = copy.deepcopy(self._learner.network())
+        facts = {"steps": self._learner.steps, "cpu_seconds": round(self._seconds, 1)}
         about = PolicyCard(
             environment=card.name,
-            task=self._lesson.task.name,
-            repeat=self._lesson.scenes.repeat,
+            task=lesson.task,
+            repeat=lesson.repeat,
             low=[*map(float, card.action.low)],
             high=[*map(float, card.action.high)],
-            inputs=self._lesson.inputs,
-            layers=layers,
+            inputs=lesson.measured.inputs,
+            layers=layers_of(network),
             training={**self._about, **facts},
         )
         return SavedPolicy(about, network)
 
-    @staticmethod
-    def _mean(values: Sequence[float] | None) -> float | None:
-        return float(np.mean(values)) if values else None
+
+def measured_in(stored: Mapping[str, Any]) -> Measured:
+    """What a checkpoint says of observations."""
+    return Measured(PolicyInputs(**stored["inputs"]), stored["unit"])
+
+
+def load_checkpoint(path: Path) -> dict[str, Any] | None:
+    """The contents of a checkpoint, if there is one; nothing in it is run.
+
+    Raises:
+        DataError: it is damaged, or of another version.
+    """
+    if not path.exists():
+        return None
+    found: Any = load_plain(path)
+    if not isinstance(found, dict) or found.get("version") != VERSION:  # pyright: ignore
+        raise DataError(f"{path} is no checkpoint of this version: delete it to begin anew")
+    return cast(dict[str, Any], found)

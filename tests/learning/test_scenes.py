@@ -9,10 +9,10 @@ from acwm_core.env.task import TaskEnvironment
 from acwm_core.errors import RecipeError
 from acwm_core.training.run import load_run
 from acwm_planning.policies.saved import PolicyInputs
+from acwm_policy.episodes import Episodes
 from acwm_policy.lesson import begin_episodes, find_task, prepare
 from acwm_policy.scenes import DreamScenes, SimulatorScenes
 from tests import tiny
-from tests.extras import needs
 from tests.scene.dots import world_of
 from tests.scene.test_values import model_of_arms
 
@@ -84,28 +84,28 @@ def test_dreamt_scenes_are_the_simulated_ones(bundle, begun):
         assert np.abs(passed - simulated.step(actions)["position"]).max() <= 0.51
 
 
-@needs("stable_baselines3")
 @pytest.mark.parametrize("task", [tiny.PLACE, tiny.SHY], ids=["place", "shy"])
 def test_reward_and_ends_are_those_of_the_task(bundle, begun, task):
     """Against the simulator with its task, action by action, until every scene has ended."""
-    from acwm_policy.vector import TaskScenes
-
     goals, number, moves = [start.goal for start in begun.starts], 6, rows(3, 6, seed=1)
     for row, start in enumerate(begun.starts[:3]):  # these go where they are to go
         away = start.goal.state["position"] - world_start(begun.specs[row])
         moves[:, row] = np.clip(away / tiny.STRIDE / np.arange(1, 4)[:, None], -2, 2)
     scenes = SimulatorScenes(bundle.card, begun.specs, goals, tiny.STRIDE, number)
-    vector = TaskScenes(scenes, task, bundle.card, INPUTS, unit=2.0, bonus=5.0)
-    vector.begin(range(number))
+    episodes = Episodes(scenes, task, bundle.card, INPUTS, unit=2.0, bonus=5.0)
+    episodes.begin(range(number))
     total, ended = np.zeros(number), {}
     for actions in moves:
-        vector.step_async(actions / 2)
-        _, rewards, over, infos = vector.step_wait()
+        step = episodes.step(torch.from_numpy(actions / 2))
         for row in range(number):
             if row not in ended:
-                total[row] += rewards[row]
-                if over[row]:
-                    ended[row] = infos[row]
+                total[row] += step.rewards[row].item()
+                if step.over[row]:
+                    ended[row] = {
+                        name: value[row].item()
+                        for name, value in step._asdict().items()
+                        if name in ("solved", "late", "failed", "returns")
+                    }
     assert len(ended) == number  # after three steps, the task's twelve actions
     for row in range(number):
         env = TaskEnvironment(make_environment("slide", {"size": (32, 32)}), task)
@@ -114,12 +114,14 @@ def test_reward_and_ends_are_those_of_the_task(bundle, begun, task):
         for action in np.repeat(moves[:, row], tiny.STRIDE, 0):
             if not (solved or late):
                 _, _, solved, late, info = env.step(action)
-        assert ended[row]["is_success"] == solved
-        assert ended[row]["TimeLimit.truncated"] == (late and not solved)
+        assert ended[row]["solved"] == solved
+        assert ended[row]["late"] == (late and not solved)
         assert ended[row]["failed"] == info["failed"]
         assert total[row] == pytest.approx((begin - info["distance"]) / 2 + 5 * solved, abs=1e-5)
+        assert total[row] == pytest.approx(ended[row]["returns"], abs=1e-5)
     if task is tiny.PLACE:
-        assert {info["is_success"] for info in ended.values()} == {True, False}
+        assert {info["solved"] for info in ended.values()} == {True, False}
+        assert episodes.score()[0] == pytest.approx(np.mean([e["solved"] for e in ended.values()]))
 
 
 def world_start(spec):
@@ -127,22 +129,50 @@ def world_start(spec):
     return env.reset(options={"spec": spec})[1]["state"]["position"]
 
 
-@needs("stable_baselines3")
 def test_an_ended_scene_shows_its_last_state_and_begins_anew(bundle, begun):
-    from acwm_policy.vector import TaskScenes
-
     lesson = prepare(bundle, tiny.PLACE, begun, "dream", 4)
-    assert lesson.inputs.state == lesson.inputs.goal == {"position": [2]}
-    vector = TaskScenes(lesson.scenes, tiny.PLACE, bundle.card, INPUTS, unit=1.0)
-    vector.begin([0, 1, 2, 3])
-    for step in range(3):
-        vector.step_async(np.full((4, 2), -1.0))
-        shown, _, over, infos = vector.step_wait()
-        for row in np.flatnonzero(over):
-            last = infos[row]["terminal_observation"]
-            assert np.abs(last[:2]).max() <= 24 - 8 * (step + 1)  # of 24 pixels, 8 a step
-            assert np.array_equal(shown[row, 4:], [0, 0])  # nothing has moved yet
-    assert over.any()
+    assert lesson.measured.inputs.state == lesson.measured.inputs.goal == {"position": [2]}
+    scenes = DreamScenes(bundle.world_model, begun.starts, 4)
+    episodes = Episodes(scenes, tiny.PLACE, bundle.card, INPUTS, unit=1.0)
+    episodes.begin([0, 1, 2, 3])
+    for number in range(3):
+        step = episodes.step(torch.full((4, 2), -1.0))
+        for row in step.over.nonzero()[:, 0]:
+            assert step.last[row, :2].abs().max() <= 24 - 8 * (number + 1)  # of 24 pixels, 8 a step
+            assert step.vectors[row, 4:].tolist() == [0, 0]  # nothing has moved yet
+    assert step.over.any()
+
+
+def test_a_dream_has_the_gradients_of_its_rewards(bundle, begun):
+    """Against small changes of the actions, over two steps, the second from carried states."""
+
+    def rewards(actions):
+        scenes = DreamScenes(bundle.world_model, begun.starts, 3)
+        options = {"unit": 2.0, "watched": ["position"]}
+        episodes = Episodes(scenes, tiny.PLACE, bundle.card, INPUTS, **options)
+        episodes.begin([0, 1, 2])
+        return torch.stack([episodes.step(row).rewards for row in actions])
+
+    actions = torch.from_numpy(rows(2, 3) / 4)
+    leaf = actions.clone().requires_grad_()
+    rewards(leaf)[1].sum().backward()
+    assert torch.equal(rewards(leaf).detach(), rewards(actions))
+    for place in np.ndindex(*actions.shape):
+        change = torch.zeros_like(actions)
+        change[place] = 0.02
+        slope = (rewards(actions + change) - rewards(actions - change))[1].sum() / 0.04
+        assert leaf.grad[place] == pytest.approx(slope.item(), abs=0.05)
+    assert leaf.grad.abs().max() > 0.5
+
+
+def test_gradients_end_where_they_are_forgotten(bundle, begun):
+    scenes = DreamScenes(bundle.world_model, begun.starts, 2)
+    first, second = (torch.full((2, 2), 0.5, requires_grad=True) for _ in range(2))
+    scenes.move(first)
+    scenes.detach()
+    scenes.move(second)["position"].sum().backward()
+    assert first.grad is None
+    assert second.grad.abs().min() > 0
 
 
 def test_a_task_that_looks_at_more_is_refused(bundle, begun):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from torch import nn
 from acwm_core.cli import main
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
 from acwm_core.training.run import load_run
-from acwm_planning.policies.saved import SavedPolicy, raw_actions
-from acwm_policy import settings as settings_module
+from acwm_planning.policies.saved import SavedPolicy, layers_of, network_of, raw_actions
+from acwm_policy.lesson import begin_episodes, prepare
 from acwm_policy.settings import PolicySettings, settings_of
 from tests import tiny
 from tests.extras import needs
@@ -38,85 +39,61 @@ def train(run, out, *, steps, algorithm="sac", parameters=SMALL, **options):
 @pytest.mark.parametrize("algorithm", ["sac", "ppo", "td3"])
 def test_the_file_acts_as_the_learner_does(run, algorithm):
     """Without the library, the saved network gives the library's own deterministic actions."""
-    from acwm_policy.learner import make_learner, network_in
-    from acwm_policy.lesson import begin_episodes, prepare
-    from acwm_policy.vector import TaskScenes
-
     bundle = load_run(run)
     begun = begin_episodes(bundle.card, 1, tiny.PLACE, 2)
-    lesson = prepare(bundle, tiny.PLACE, begun, "dream", 2)
-    vector = TaskScenes(lesson.scenes, tiny.PLACE, bundle.card, lesson.inputs, unit=1.0)
-    learner = make_learner(PolicySettings(algorithm), vector, 0)
+    learner = PolicySettings(algorithm).learner()
+    learner.begin(prepare(bundle, tiny.PLACE, begun, "dream", 2), 0)
     observed = np.random.default_rng(0).normal(0, 3, (50, 6)).astype(np.float32)
-    wanted, _ = learner.predict(observed, deterministic=True)
-    _, network = network_in(learner)
+    wanted, _ = learner._model.predict(observed, deterministic=True)
+    network = learner.network()
     with torch.no_grad():
-        found = network(torch.from_numpy(observed)).numpy()
-    assert np.abs(found.clip(-1, 1) - wanted).max() < 1e-5
+        found = network_of(layers_of(network), network.state_dict())(torch.from_numpy(observed))
+    assert np.abs(found.clamp(-1, 1).numpy() - wanted).max() < 1e-5
     assert np.ptp(wanted) > 0.01
 
 
-@needs("stable_baselines3")
-@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
-def test_a_killed_training_goes_on(run, tmp_path, monkeypatch, algorithm):
-    """It ends after its fifth checkpoint; the next command has all that was learnt till then."""
+FEW = {
+    "sac": {**SMALL, "learning_starts": 16, "gradient_steps": 1},
+    "ppo": {**SMALL, "n_steps": 8},
+    "td3": {**SMALL, "learning_starts": 16, "gradient_steps": 1},
+    "backprop": {"net_arch": [16], "horizon": 2},
+}
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [pytest.param(a, marks=needs("stable_baselines3")) if a != "backprop" else a for a in FEW],
+)
+def test_a_killed_training_ends_as_one_that_was_not(run, tmp_path, monkeypatch, algorithm):
+    """It is killed after its second checkpoint, and the same command gives the same policy."""
     from acwm_policy import train as module
 
     class Killed(BaseException):
         pass
 
-    kept, restored = [], []
-    save, restore = module.save_checkpoint, module.restore
+    wanted = {"steps": 320, "algorithm": algorithm, "parameters": FEW[algorithm]}
+    whole = train(run, tmp_path / "whole", **wanted)
+    save, saved = module._Keeper.save, []
 
-    def save_and_die(path, learner, scenes, **more):
-        save(path, learner, scenes, **more)
-        kept.append(learner)
-        if len(kept) == 5:
+    def save_and_die(self):
+        save(self)
+        saved.append(self)
+        if len(saved) == 2:
             raise Killed
 
-    def look(learner, scenes, whole):
-        restore(learner, scenes, whole)
-        assert learner.num_timesteps == kept[4].num_timesteps
-        assert learner._n_updates == kept[4]._n_updates
-        for name in learner._get_torch_save_params()[0]:
-            one, other = (_tensors(_member(each, name).state_dict()) for each in (learner, kept[4]))
-            assert len(one) == len(other) > 0
-            assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
-        if algorithm == "sac":
-            held, before = learner.replay_buffer, kept[4].replay_buffer
-            assert held.pos == before.pos > 0
-            assert np.array_equal(held.next_observations, before.next_observations)
-            assert torch.equal(learner.log_ent_coef, kept[4].log_ent_coef)
-        restored.append(learner)
-
-    few = {"learning_starts": 16, "gradient_steps": 1} if algorithm == "sac" else {"n_steps": 8}
-    wanted = {"steps": 320, "algorithm": algorithm, "parameters": {**SMALL, **few}}
-    monkeypatch.setattr(module, "save_checkpoint", save_and_die)
+    monkeypatch.setattr(module._Keeper, "save", save_and_die)
     with pytest.raises(Killed):
         train(run, tmp_path / "policy", **wanted)
-    monkeypatch.setattr(module, "save_checkpoint", save)
-    monkeypatch.setattr(module, "restore", look)
+    monkeypatch.setattr(module._Keeper, "save", save)
     policy = train(run, tmp_path / "policy", **wanted)
-    assert restored
-    assert policy.card.training["steps"] >= 320
-    rows = [*csv.reader((tmp_path / "policy" / "curve.csv").open())]
-    assert rows[0] == ["steps", "success", "return", "cpu_seconds"]
-    steps = [int(row[0]) for row in rows[1:]]
-    assert steps == sorted({*steps})
-    assert steps[0] < kept[4].num_timesteps < steps[-1]
-
-
-def _member(learner, name):
-    for part in name.split("."):
-        learner = getattr(learner, part)
-    return learner
-
-
-def _tensors(tree):
-    if isinstance(tree, torch.Tensor):
-        return [tree]
-    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
-    return [tensor for part in parts for tensor in _tensors(part)]
+    assert policy.card.training["steps"] == whole.card.training["steps"] >= 320
+    one, other = (each._network.state_dict() for each in (policy, whole))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    curves = [[*csv.reader((tmp_path / name / "curve.csv").open())] for name in ("policy", "whole")]
+    assert curves[0][0] == ["steps", "success", "return", "cpu_seconds"]
+    kept, usual = ([row[:3] for row in curve] for curve in curves)
+    assert kept == usual
+    assert len(kept) > 3
 
 
 @needs("stable_baselines3")
@@ -166,7 +143,8 @@ def test_parameters_are_those_of_the_algorithm():
 
 
 def test_without_the_library_the_message_names_the_extra(monkeypatch):
-    monkeypatch.setattr(settings_module, "LIBRARY", "no_such_library")
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    monkeypatch.delitem(sys.modules, "acwm_policy.library", raising=False)
     with pytest.raises(MissingExtraError, match=r"pip install 'acwm\[policies\]'"):
         settings_of([])
 
@@ -188,7 +166,7 @@ def test_wrong_words_are_one_sentence(capsys, words, said):
 
 def test_actions_are_in_the_units_of_the_card():
     low, high = np.array([-2.0, 0.0]), np.array([2.0, 10.0])
-    found = raw_actions(np.array([[-1.0, 0.0], [3.0, -7.0], [0.5, 1.0]]), low, high)
+    found = raw_actions(torch.tensor([[-1.0, 0.0], [3.0, -7.0], [0.5, 1.0]]), low, high)
     assert found.tolist() == [[-2, 5], [2, 0], [1, 10]]
 
 

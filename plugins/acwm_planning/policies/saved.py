@@ -34,8 +34,6 @@ ACTIVATIONS: Mapping[str, type[nn.Module]] = {
 }
 """What may stand between linear layers, by its name in the file."""
 
-Values = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class PolicyInputs:
@@ -63,22 +61,24 @@ class PolicyInputs:
         """Number of values of the vector."""
         return len(self.mean) + len(self.change)
 
-    def vectors(self, now: Values, before: Values, goals: Values) -> NDArray[np.float32]:
+    def vectors(self, now: Tensor, before: Tensor, goals: Tensor) -> Tensor:
         """The vectors `[N, size]` of states `[N, S]`, earlier ones, and goals `[N, G]`."""
-        mean, std, change = (np.array(each) for each in (self.mean, self.std, self.change))
-        values = np.concatenate([now, goals], 1)
-        parts = [(values - mean) / std, (now - before) / change]
-        whole = np.nan_to_num(np.concatenate(parts, 1), nan=0.0, posinf=FURTHEST, neginf=-FURTHEST)
-        return whole.clip(-FURTHEST, FURTHEST).astype(np.float32)
+        mean, std, change = (
+            torch.tensor(each, dtype=torch.float64) for each in (self.mean, self.std, self.change)
+        )
+        values = torch.cat([now, goals], 1)
+        whole = torch.cat([(values - mean) / std, (now - before) / change], 1)
+        whole = whole.nan_to_num(nan=0.0, posinf=FURTHEST, neginf=-FURTHEST)
+        return whole.clamp(-FURTHEST, FURTHEST).float()
 
 
-def side_by_side(fields: Mapping[str, Any], shapes: Mapping[str, Sequence[int]]) -> Values:
-    """The values of some fields `[N, …]` side by side, `[N, S]`."""
+def side_by_side(fields: Mapping[str, Any], shapes: Mapping[str, Sequence[int]]) -> Tensor:
+    """The values of some fields `[N, …]` side by side, `[N, S]` in float64."""
     parts = [
-        np.asarray(fields[name], np.float64).reshape(-1, math.prod(shape))
+        torch.as_tensor(fields[name], dtype=torch.float64).reshape(-1, math.prod(shape))
         for name, shape in shapes.items()
     ]
-    return np.concatenate(parts, 1)
+    return torch.cat(parts, 1)
 
 
 @dataclass(frozen=True)
@@ -118,18 +118,13 @@ class SavedPolicy:
 
     def __init__(self, card: PolicyCard, network: nn.Module) -> None:
         self.card, self._network = card, network.eval()
-        self._low, self._high = np.array(card.low), np.array(card.high)
-        self._before: Values | None = None
-        self._goal: Values | None = None
+        self._before: Tensor | None = None
+        self._goal: Tensor | None = None
 
-    def actions(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Raw actions `[N, A]` for vectors of observations `[N, O]`."""
-        return raw_actions(self.scaled(vectors), self._low, self._high)
-
-    def scaled(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    @torch.no_grad()
+    def scaled(self, vectors: Tensor) -> Tensor:
         """Actions scaled to [-1, 1], `[N, A]`, for vectors of observations `[N, O]`."""
-        with torch.no_grad():
-            return self._network(torch.from_numpy(vectors)).numpy()
+        return self._network(vectors)
 
     def reset(self, goal: Goal) -> None:
         """Start an episode."""
@@ -152,9 +147,9 @@ class SavedPolicy:
             raise RecipeError("a policy needs its goal: call reset(goal) first")
         now = side_by_side({name: np.asarray(state[name])[None] for name in shapes}, shapes)
         before = now if self._before is None else self._before
-        now = np.where(np.isfinite(now), now, before)
-        self._before = now
-        return self.actions(self.card.inputs.vectors(now, before, self._goal))[0]
+        self._before = now = torch.where(now.isfinite(), now, before)
+        scaled = self.scaled(self.card.inputs.vectors(now, before, self._goal))
+        return raw_actions(scaled, self.card.low, self.card.high)[0].numpy()
 
     def save(self, folder: Path) -> None:
         """Write the policy's file into a folder."""
@@ -186,11 +181,11 @@ class SavedPolicy:
         return cls(card, network)
 
 
-def raw_actions(scaled: NDArray[Any], low: Values, high: Values) -> NDArray[np.float32]:
+def raw_actions(scaled: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
     """Actions scaled to [-1, 1], `[…, A]`, in the units of the environment, within its bounds."""
-    raw = low + (np.asarray(scaled, np.float64).clip(-1, 1) + 1) / 2 * (high - low)
-    bounds = np.asarray(low, np.float32), np.asarray(high, np.float32)
-    return np.clip(raw.astype(np.float32), *bounds)
+    least, most = (torch.tensor(each, dtype=torch.float64) for each in (low, high))
+    raw = least + (scaled.double().clamp(-1, 1) + 1) / 2 * (most - least)
+    return raw.float().clamp(least.float(), most.float())
 
 
 def network_of(layers: Sequence[int | str], weights: Mapping[str, Tensor]) -> nn.Sequential:
@@ -207,6 +202,23 @@ def network_of(layers: Sequence[int | str], weights: Mapping[str, Tensor]) -> nn
     network = nn.Sequential(*modules)
     network.load_state_dict(dict(weights))
     return network
+
+
+def layers_of(network: nn.Sequential) -> list[int | str]:
+    """The layers of a network as a policy's file names them.
+
+    Raises:
+        RecipeError: it has layers that such a file cannot hold.
+    """
+    names, layers = {kind: name for name, kind in ACTIVATIONS.items()}, list[int | str]()
+    for module in network:
+        if isinstance(module, nn.Linear):
+            layers.append(module.out_features)
+        elif type(module) in names:
+            layers.append(names[type(module)])
+        else:
+            raise RecipeError(f"a policy with a layer {type(module).__name__} cannot be saved")
+    return layers
 
 
 def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
