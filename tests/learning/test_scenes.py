@@ -14,7 +14,7 @@ from acwm_policy.lesson import begin_episodes, find_task, prepare
 from acwm_policy.scenes import DreamScenes, SimulatorScenes
 from tests import tiny
 from tests.scene.dots import world_of
-from tests.scene.test_values import model_of_arms
+from tests.scene.mechanics import model_of_arms
 
 INPUTS = PolicyInputs({"position": [2]}, {"position": [2]}, [0.0] * 4, [1.0] * 4, [1.0] * 2)
 

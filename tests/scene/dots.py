@@ -33,9 +33,9 @@ def world_of(model, stride=4, *, states=0, objective=None):
     )
 
 
-def learn_motion(world, states, actions, *, steps=200, clips=64, until=1.0):
+def learn_motion(world, states, actions, *, steps=200, clips=64, until=1.0, rate=3e-3):
     """Teach a scene for some steps how things move."""
-    optimizer = torch.optim.AdamW(world.parameters(), 3e-3)
+    optimizer = torch.optim.AdamW(world.parameters(), rate)
     random = torch.Generator().manual_seed(0)
     for step in range(steps):
         rows = torch.randint(len(states), (clips,), generator=random)

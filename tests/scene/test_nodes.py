@@ -1,59 +1,16 @@
 """A rope of nodes: they are read, moved and drawn, each learnt from the truth of the others."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
-from acwm_core.env.camera import Camera
-from acwm_core.model.conditioner import Conditioning
-from acwm_scene import node_group as node_group_module
-from acwm_scene import node_windows as node_windows_module
 from acwm_scene.agent_sight import AgentSight, cell_places
-from acwm_scene.declared import GroupSpec
 from acwm_scene.group import at_frame
 from acwm_scene.node_motion import NodeMotion
 from acwm_scene.node_sight import HIDDEN, NodeSight, form_loss
 from acwm_scene.node_windows import node_windows
 from acwm_scene.nodes import Form, NodeLayout, View, evenly, spacing, unstretched
-from acwm_scene.scene import SceneDynamics
-from tests.scene.dots import follow, learn_motion, world_of
-
-NODES, FRAMES, REACH = 9, 17, 1.0
-CAMERA = Camera((0.0, -6.0, 9.0), (0.0, 0.5, 0.0), fov=40.0)
-
-
-def ropes(clips, seed):
-    """An agent that goes where it is told, and a line of nodes that it pushes; as states.
-
-    It leaves each node at the distance `REACH` behind which it was met, so that all that happens
-    follows from simple geometry.
-    """
-    random = np.random.default_rng(seed)
-    actions = random.uniform(-1, 1, (clips, FRAMES, 2)).astype(np.float32).repeat(4, 1)[:, :FRAMES]
-    agent, nodes = np.zeros((clips, FRAMES, 2)), np.zeros((clips, FRAMES, NODES, 2))
-    agent[:, 0] = random.uniform(-3, 3, (clips, 2))
-    angle = random.uniform(0, 2 * math.pi, (clips, 1))
-    along = np.linspace(-1.5, 1.5, NODES)
-    nodes[:, 0] = np.stack([np.cos(angle) * along, np.sin(angle) * along], -1)
-    for now in range(1, FRAMES):
-        goal = 3 * actions[:, now - 1]
-        agent[:, now] = agent[:, now - 1] + 0.3 * (goal - agent[:, now - 1])
-        apart = nodes[:, now - 1] - agent[:, now, None]
-        far = np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-6)
-        pushed = agent[:, now, None] + apart / far * REACH
-        nodes[:, now] = np.where(far < REACH, pushed, nodes[:, now - 1])
-    states = np.concatenate([agent, nodes.reshape(clips, FRAMES, -1)], -1)
-    return torch.tensor(states, dtype=torch.float32), torch.tensor(actions)
-
-
-def model_of_ropes(**parameters):
-    size = 2 + 2 * NODES
-    spec = GroupSpec("nodes", tuple(range(size)), agents=1, axes=2, nodes=(NODES,), camera=CAMERA)
-    asked = {"latent_channels": 2, "temporal_stride": 1, "every": 1, "unit": 1.0}
-    asked |= {"specs": {"nodes": spec}, "state_size": size}
-    return SceneDynamics(**asked | {"channels": 16, "width": 32, "blocks": 1} | parameters)
+from tests.scene.mechanics import CAMERA, NODES, model_of_ropes, ropes
 
 
 def test_states_are_nodes_in_units():
@@ -73,27 +30,6 @@ def test_forms_are_states_as_they_were_recorded(every):
     states = torch.cat([torch.arange(6.0), nodes])[None, None] * 0.3
     layout = NodeLayout(2, 3, [7, 5], every, 0.1)
     torch.testing.assert_close(layout.states(layout.form(states)), states)
-
-
-def test_it_draws_the_states_that_it_predicts():
-    """With these as true ones, it draws the same pictures; alike beginnings may be given once."""
-    torch.manual_seed(0)
-    model = model_of_ropes(every=2).eval()
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    given = torch.randn(1, 1, 2, 8, 8)
-    clips = Conditioning(torch.randn(3, 6, model.width), None, None)
-    (group,) = model.groups.children()
-    with torch.no_grad():
-        states = model.predict_states(given, clips, 6)
-        given = given.expand(3, -1, -1, -1, -1)
-        own = model(given, clips, 6)
-        first = group.decode(Form(*(each[:, None] for each in group.frame(group.read(given)))))
-        numbers = torch.arange(5).expand(3, -1)
-        drawn = model.draw_true(given, torch.cat([first, states], 1), numbers)
-        torch.testing.assert_close(states, model.predict_states(given, clips, 6))
-    assert states.shape == (3, 5, 2 + 2 * NODES)
-    torch.testing.assert_close(drawn, own, atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1.75])
@@ -206,23 +142,23 @@ def test_a_shadow_tells_how_far_away_an_agent_is():
     light = torch.tensor([0.8, -0.5, 1.0])
     layout, view = NodeLayout(1, 3, [3], 1, 1.0), View(CAMERA, 1.0)
     sight = AgentSight(2, layout, view, light.tolist())
-    optimizer = torch.optim.AdamW(sight.parameters(), 5e-3)
+    optimizer = torch.optim.AdamW(sight.parameters(), 1e-2)
     cells = cell_places(torch.Size([16, 16]), torch.device("cpu"))
 
-    def pictures(low, high):
-        share = torch.rand(48, 1, 3)
+    def pictures(low, high, clips=16):
+        share = torch.rand(clips, 1, 3)
         true = share * torch.tensor([high - low, 3.0, 1.6]) + torch.tensor([low, -1.5, 0.2])
         fallen = true - true[..., 2:] / light[2] * light
         seen = [view(each, 1.0)[..., :2] for each in (true, fallen)]
         spots = [torch.exp(-60 * (each - cells).square().sum(-1)) for each in seen]
         return torch.stack(spots, 1).unflatten(2, (16, 16)), true
 
-    for step in range(150):
+    for step in range(100):
         frames, true = pictures(-2.0, 0.0)
         if step % 2:
             frames, true = frames.flip(3), true * torch.tensor([-1.0, 1.0, 1.0])
         learn_to_find(sight, optimizer, frames, true)
-    frames, true = pictures(0.0, 2.0)
+    frames, true = pictures(0.0, 2.0, clips=48)
     assert missed(sight, frames, true) < 0.2
     lightless = frames * torch.tensor([1.0, 0.0])[:, None, None]
     assert missed(sight, lightless, true) > 0.4
@@ -303,26 +239,12 @@ def test_windows_are_seen_from_other_sides_and_ends():
 
 
 @pytest.mark.ci
-def test_it_learns_how_agents_push_nodes(monkeypatch):
-    """Two hundred steps on short windows foretell whole clips of a simple mechanics."""
-    monkeypatch.setattr(node_windows_module, "NODES", 4000)
-    monkeypatch.setattr(node_group_module, "MOTION_CHANNELS", 32)
-    world = world_of(model_of_ropes(), stride=1, states=2 + 2 * NODES)
-    learn_motion(world, *ropes(256, seed=0), until=1 / 3)
-    states, actions = ropes(64, seed=1)
-    true = world.model.encode(states)["nodes"].nodes
-    made = follow(world, states, actions)["nodes"].nodes
-    off = (made[:, -1] - true[:, -1]).norm(dim=-1).mean()
-    assert off < 0.5 * (true[:, 0] - true[:, -1]).norm(dim=-1).mean()
-
-
-@pytest.mark.ci
 def test_it_finds_a_line_in_a_picture_from_either_end():
     torch.manual_seed(0)
     layout = NodeLayout(1, 2, [NODES], 1, 1.0)
     view = View(CAMERA, 1.0)
     sight = NodeSight(2, layout, view, None, 24)
-    optimizer = torch.optim.AdamW(sight.parameters(), 3e-3)
+    optimizer = torch.optim.AdamW(sight.parameters(), 6e-3)
     sides = (torch.arange(12) + 0.5) / 6 - 1
     cells = torch.stack(torch.meshgrid(sides, sides, indexing="xy"), -1).flatten(0, 1)
 
@@ -339,33 +261,16 @@ def test_it_finds_a_line_in_a_picture_from_either_end():
         other = true.reversed(torch.ones(len(true.nodes), dtype=torch.bool))
         return [torch.minimum(form_loss(each, true), form_loss(each, other)) for each in forms]
 
-    for step in range(120):
-        frames, true = pictures(64, step)
+    for step in range(60):
+        frames, true = pictures(24, step)
         optimizer.zero_grad()
         torch.stack(missed(sight.look(frames)[0], true)).mean().backward()
         optimizer.step()
     frames, true = pictures(64, 1000)
     with torch.no_grad():
         first, *_, last = missed(sight.look(frames)[0], true)
-    assert last.mean() < 0.25
+    assert last.mean() < 0.3
     assert last.mean() < first.mean()
-
-
-def test_it_draws_true_states_and_learns_nothing_of_motion_by_it():
-    torch.manual_seed(0)
-    model = model_of_ropes().eval()
-    torch.nn.init.normal_(model.drawing.out.weight)
-    states, _ = ropes(2, seed=0)
-    given, numbers = torch.randn(2, 1, 2, 8, 8), torch.arange(FRAMES - 1).expand(2, -1)
-    drawn = model.draw_true(given, states, numbers)
-    drawn.square().mean().backward()
-    (group,) = model.groups.children()
-    idle = [*group.sight.parameters(), *model.motion_parameters()]
-    assert all(each.grad is None for each in idle)
-    other = states.clone()
-    other[:, 9] += 1
-    changed = (model.draw_true(given, other, numbers) - drawn).abs().amax((0, 2, 3, 4))
-    assert changed.nonzero().flatten().tolist() == [8]  # frame 9 is the 9th after the given one
 
 
 def test_it_learns_to_draw_nodes_as_wrong_as_it_reads_them_and_in_its_order():

@@ -60,7 +60,7 @@ def model_of_balls(**parameters):
 def learnt():
     model = model_of_balls()
     latents, _, actions = balls(256, seed=1)
-    learn_points(model, clips := clips_of(latents), 150)
+    learn_points(model, clips := clips_of(latents), 110)
     world = world_of(model, stride=1, states=4)
     learn_motion(world, states_with_points(model, clips), actions, steps=120, clips=32)
     return world

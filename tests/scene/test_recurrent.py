@@ -124,9 +124,9 @@ def test_several_given_frames_show_velocities():
         torch.manual_seed(0)
         model = RecurrentModel(latent_channels=1, channels=8, width=16, blocks=1)
         optimizer = torch.optim.AdamW(model.parameters(), 1e-2)
-        for step in range(200):
+        for step in range(120):
             optimizer.zero_grad()
-            Regression().loss(model, drifting(32, step), known).backward()
+            Regression().loss(model, drifting(16, step), known).backward()
             optimizer.step()
         with torch.no_grad():
             errors[known] = Regression().loss(model, drifting(256, 10_000), known).item()
@@ -153,8 +153,8 @@ def test_it_learns_to_move_what_actions_move():
     world = world_of(model, stride=1)
     config = TrainingConfig(optimizer="muon", learning_rate=1e-2)
     optimizer = build_optimizer(world, config, fused=False)
-    for step in range(150):
-        latents, moves = moving_dots(32, step)
+    for step in range(100):
+        latents, moves = moving_dots(24, step)
         loss = world.loss(latents, moves, [])
         optimizer.zero_grad()
         loss.backward()
