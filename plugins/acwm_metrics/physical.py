@@ -89,9 +89,8 @@ def counts(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.int64
     return np.bincount(keys.ravel(), minlength=frames * 256).reshape(frames, 256)[:, ids]
 
 
-def usual_sizes(masks: NDArray[np.uint8], ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The median area of instances over the frames that show them, `[n]`; 0 without any."""
-    areas = counts(masks, ids)
+def usual_sizes(areas: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The median of areas `[T, n]` over the frames that show an instance, `[n]`; 0 without any."""
     return np.array([np.median(a[a > 0]) if a.any() else 0.0 for a in areas.T])
 
 

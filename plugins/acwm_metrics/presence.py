@@ -91,10 +91,12 @@ def _areas(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Ids `[n]` of all objects, their areas in the prediction `[T, n]`, and usual areas `[n]`."""
     ids = ids_of(prediction, physics_of(prediction).objects)
-    return prediction.once(
-        _areas,
-        lambda: (ids, counts(seen_of(prediction).masks, ids), usual_sizes(prediction.masks, ids)),
-    )
+
+    def areas() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        seen, true = (counts(each, ids) for each in (seen_of(prediction).masks, prediction.masks))
+        return ids, seen, usual_sizes(true)
+
+    return prediction.once(_areas, areas)
 
 
 def hidden(

@@ -121,6 +121,11 @@ def lost_bodies(prediction: Prediction, reading: Reading) -> Mask:
 
     What vanished in sight is lost until it is found again.
     """
+    key = (lost_bodies, reading.field, tuple(reading.instances))
+    return prediction.once(key, lambda: _lost(prediction, reading))
+
+
+def _lost(prediction: Prediction, reading: Reading) -> Mask:
     missing = ~found(seen_of(prediction), reading)
     lost = missing & shown(prediction, reading.instances)
     for frame in range(1, len(lost)):
@@ -171,9 +176,12 @@ def shown(prediction: Prediction, names: Sequence[str]) -> Mask:
     The frames beside those that hide it are left out, because there an estimator may err by one. A
     lone frame shows nothing: in no frame before it could a thing have been seen last.
     """
-    ids = ids_of(prediction, names)
-    areas, sizes = counts(prediction.masks, ids), usual_sizes(prediction.masks, ids)
-    least = np.maximum(MIN_SHARE * sizes, MIN_AREA * prediction.masks[0].size)
+    return prediction.once((shown, tuple(names)), lambda: _shown(prediction, names))
+
+
+def _shown(prediction: Prediction, names: Sequence[str]) -> Mask:
+    areas = counts(prediction.masks, ids_of(prediction, names))
+    least = np.maximum(MIN_SHARE * usual_sizes(areas), MIN_AREA * prediction.masks[0].size)
     there = ((areas >= least) & (len(areas) > 1)).astype(np.uint8)
     return np.asarray(ndimage.minimum_filter(there, (3, 1), mode="nearest"), np.bool_)
 

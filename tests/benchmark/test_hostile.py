@@ -65,9 +65,9 @@ ARRAYS = {
     "negative": npy(header("(-1, 32, 32, 3)")),
     "objects": npy(header(SHAPE, "|O"), bytes(27648)),
     "records": npy(b"{'descr': [('a', '|u1')], 'fortran_order': False, 'shape': (9, 32, 32, 3)}\n"),
-    "more than it says": npy(header(SHAPE), bytes(200_000_000)),
+    "more than it says": lambda: npy(header(SHAPE), bytes(200_000_000)),
     "less than it says": npy(header(SHAPE), bytes(1000)),
-    "header of zeros": npy(bytes(300_000_000), version=2),
+    "header of zeros": lambda: npy(bytes(300_000_000), version=2),
     "header of brackets": npy(b"(" * 9000),
     "version 9": npy(header(SHAPE), version=9),
     "no array": b"GIF89a and nothing else",
@@ -77,7 +77,8 @@ ARRAYS = {
 
 @pytest.mark.parametrize("name", ARRAYS)
 def test_arrays_that_lie(name, folder, tasks):
-    zipped(folder / f"{CLIP}.npz", {"video.npy": ARRAYS[name]})
+    content = ARRAYS[name]
+    zipped(folder / f"{CLIP}.npz", {"video.npy": content() if callable(content) else content})
     said = sentence("score", folder, "--tasks", tasks)
     assert said.startswith(f"acwm: {CLIP}: ood_test-000002.npz")
 

@@ -1,5 +1,6 @@
 """Recipes of every model, conditioner and objective that is installed, in small."""
 
+import functools
 import itertools
 from inspect import signature
 
@@ -38,6 +39,7 @@ def recipe(data, model, conditioner, objective, training=None, trainer=None):
     )
 
 
+@functools.cache
 def combinations():
     """Test parameters: those that fit together and hold something that none before them did."""
     models = {part.target: part for part in installed("model")}.values()
