@@ -57,7 +57,8 @@ class DatasetCard:
         exploration: share of the training episodes that reuse the previous episode's actions.
         shift: by up to which share of half its range one dimension of those actions is shifted.
         source: for recorded data, what was imported: `kind`, e.g. ``"lerobot"``, `name`,
-            checksums, the `command` if one did it, and `notes` for people. Empty if simulated.
+            checksums, the `command` if one did it, `notes` for people, and `unusable`, why
+            nothing can be trained on it, if so. Empty if simulated.
     """
 
     environment: EnvironmentCard

@@ -51,13 +51,16 @@ class ClipData(L.LightningDataModule):
         codec: frozen; encodes the clips once if the recipe caches latents.
 
     Raises:
-        DataError: the recipe asks for symmetries that the data does not have.
+        DataError: the recipe asks for symmetries that the data does not have, or the card says that
+            nothing can be trained on the data.
     """
 
     def __init__(
         self, config: DataConfig, episodes: EpisodeDataset, codec: Codec, seed: int
     ) -> None:
         super().__init__()
+        if reason := episodes.card.source.get("unusable"):
+            raise DataError(f"{episodes.path} cannot be trained on: {reason}")
         self.config, self.episodes, self.codec, self.seed = config, episodes, codec, seed
         self.states = config.states
         self._split = self._divided()

@@ -77,6 +77,49 @@ def check(path: Path, replays: int) -> int:
     return int(failed > 0)
 
 
+@data.command("label")
+@click.argument("path", metavar="DATA", type=DATASET)
+@click.option(
+    "--from", "labelled", type=DATASET, required=True, help="Dataset with recorded actions."
+)
+@click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
+@click.option(
+    "--steps", type=click.IntRange(1), default=1500, show_default=True, help="Training steps."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of weights and order.")
+@click.option(
+    "--least",
+    type=click.FloatRange(0, 1),
+    default=0.0,
+    help="Mean confidence below which an episode is left out.",
+)
+def label_data(path: Path, labelled: Path, out: Path, **options: Any) -> None:
+    """Read the actions of the episodes of DATA from their videos.
+
+    An inverse dynamics model learns from the episodes of --from what action lies between frames.
+    The new dataset has the recorded episodes and the labelled ones; its card tells which are which,
+    and its state has the confidence of every action. Actions that DATA has are not used.
+    """
+    from acwm_formats.inverse.label import label
+
+    done = label(path, labelled, out, **options)
+    quality, action = done.quality, done.card.environment.action
+    click.echo(f"actions of {quality.episodes} held-out recorded episodes, read from their videos:")
+    rows = zip(action.names, action.units, quality.explained, quality.error, strict=True)
+    for name, unit, share, error in rows:
+        how = "never changes" if share != share else f"R² {share:.2f}, error {error:.3g} {unit}"
+        click.echo(f"  {name}: {how}")
+    halves = f"{quality.surer:.2f} where it is surer, {quality.less_sure:.2f} elsewhere"
+    click.echo(f"  mean R² {quality.mean:.2f}: {halves}")
+    mean = sum(done.confidence) / len(done.confidence)
+    click.echo(f"labelled {len(done.confidence)} episodes, mean confidence {mean:.2f}")
+    if done.left_out:
+        click.echo(f"left out {done.left_out} episodes of less confidence")
+    click.echo(f"{out} holds {done.card.splits['train']} training episodes")
+    if quality.mean < 0.5:
+        click.echo("less than half is explained: label more episodes, or raise --steps")
+
+
 def _print_facts(facts: dict[str, Any]) -> None:
     from rich.console import Console
 

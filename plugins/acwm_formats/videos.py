@@ -107,6 +107,7 @@ class Videos(Format):
         time: str | None = None,
         rate: float | None = None,
         from_first_row: bool = False,
+        unlabelled: bool = False,
         follow_links: bool = False,
     ) -> RecordedDataset:
         """Import a folder of videos, one episode each, with actions in a table beside each.
@@ -128,17 +129,24 @@ class Videos(Format):
             rate: Frames per second of folders of pictures.
             from_first_row: Whether the first row was taken with the first frame, if the clocks of
                 table and video differ.
+            unlabelled: Whether no actions were recorded; `acwm data label` reads them from the
+                videos, given others with actions.
             follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)
         places = find_places(root, actions)
         if not places:
             raise DataError(f"{root} holds no video and no folder of pictures")
+        if unlabelled:
+            return _without_actions(root, places, rate, follow_links)
         table = _shared(root, places, actions)
         tables = [table] if table else [place.table for place in places if place.table]
         if not tables:
             endings = ", ".join(ending[1:] for ending in READERS)
-            raise DataError(f"{root} has no table of actions beside {places[0].name}: {endings}")
+            raise DataError(
+                f"{root} has no table of actions beside {places[0].name}: {endings}; if none were "
+                "recorded, give --unlabelled"
+            )
         path = first_sound(tables, read_table)
         acting, kept = (tuple(map(composed, words(names))) for names in (columns, states))
         chosen = _columns(path, acting, kept, time and composed(time), shared=table is not None)
@@ -457,6 +465,35 @@ def _text(column: NDArray[Any]) -> str | list[str]:
     """The text of an episode; a list if it changes, of each once."""
     known = [str(value) for value in dict.fromkeys(column.tolist()) if value is not None]
     return known[0] if len(known) == 1 else known
+
+
+class UnlabelledVideos(VideoFolder):
+    """The same, of which no actions are known: they are zero, and the card says so."""
+
+    def _opened(self, place: VideoEpisode, index: int) -> TimedRecording:
+        cameras = {n: self._frames(p, None, place.begins) for n, p in place.cameras.items()}
+        first = next(iter(cameras.values()))
+        rate = video_index(first.path).rate if isinstance(first, VideoFrames) else None
+        count = len(first.times)
+        return TimedRecording(place.name, cameras, Samples(np.zeros((count, 1))), rate=rate)
+
+
+def _without_actions(
+    root: Path, places: Sequence[VideoEpisode], rate: float | None, follow_links: bool
+) -> RecordedDataset:
+    """Videos of which no actions were recorded; nothing can be trained on them as they are."""
+    columns = Columns((), (), None, None, None)
+    advice = "no actions were recorded: run `acwm data label` with episodes that have some"
+    return RecordedDataset(
+        name=word(root),
+        splits=UnlabelledVideos(dict(enumerate(places)), len(places), None, columns, rate, False),
+        facts={"kind": "videos", "name": root.resolve().name, **_facts(places, None)}
+        | {"unusable": advice},
+        options={"rate": rate, "unlabelled": True, "follow_links": follow_links},
+        actions=ActionFacts(("unknown",), bounds=((-1.0,), (1.0,))),
+        notes=(f"{advice[0].upper()}{advice[1:]}.",),
+        summary=f"Videos of {root.resolve().name}",
+    )
 
 
 def _facts(places: Sequence[VideoEpisode], table: Path | None) -> dict[str, Any]:

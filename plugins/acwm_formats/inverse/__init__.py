@@ -1,0 +1,1 @@
+"""Actions read from videos: inverse dynamics, learnt from episodes whose actions were recorded."""
