@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN, Run
+from acwm_core.errors import RecipeError
 from acwm_report.terminal import print_severity, print_summary
 
 
@@ -122,22 +123,44 @@ def report(runs: tuple[Path, ...], out: Path | None, export: Path | None, video_
 @click.option("--metric", "metrics", multiple=True, help="Compare this metric; all by default.")
 @click.option("--split", "splits", multiple=True, help="Compare on this split; all by default.")
 @click.option("--out", type=OUT_FILE, help="Also write the result to this .json.")
+@click.option(
+    "--gate",
+    is_flag=False,
+    flag_value="",
+    metavar="[METRIC,…]",
+    help="End with exit code 1 if the second of two runs is significantly worse, in any metric or "
+    "in these; give it last.",
+)
 def compare(
-    runs: tuple[Path, ...], metrics: tuple[str, ...], splits: tuple[str, ...], out: Path | None
-) -> None:
+    runs: tuple[Path, ...],
+    metrics: tuple[str, ...],
+    splits: tuple[str, ...],
+    out: Path | None,
+    gate: str | None,
+) -> int:
     """Test which runs differ significantly.
 
     Compares every pair of runs on common clips with a paired bootstrap over episodes. p-values are
     corrected for the number of comparisons (Holm).
     """
-    from acwm_report.comparison import compare_runs
+    from acwm_report.comparison import compare_runs, worsened
     from acwm_report.terminal import print_comparison
 
-    comparison = compare_runs(runs, metrics=metrics, splits=splits)
+    gated = tuple(name.strip() for name in (gate or "").split(",") if name.strip())
+    if gate is not None and (len(runs) != 2 or (gated and metrics)):
+        raise RecipeError(
+            "--gate compares two runs, and names its metrics itself: leave out --metric"
+        )
+    comparison = compare_runs(runs, metrics=gated or metrics, splits=splits)
     print_comparison(comparison)
     if out:
         comparison.write(out)
         click.echo(out)
+    if gate is None:
+        return 0
+    worse = worsened(comparison)
+    click.echo("\n".join(worse) or "gate: the second run is not significantly worse")
+    return int(bool(worse))
 
 
 @click.command()

@@ -148,6 +148,27 @@ def compare_runs(
     )
 
 
+def worsened(comparison: Comparison) -> list[str]:
+    """Where the second of two runs is significantly worse than the first, a sentence each.
+
+    Raises:
+        DataError: nothing could be tested, because there are too few episodes.
+    """
+    first, second = comparison.runs
+    tested = [d for d in comparison.differences if d.winner or d.p_corrected is not None]
+    if not tested:
+        raise DataError(
+            f"too few episodes to tell whether {second} is worse than {first}: evaluate both on "
+            "five or more"
+        )
+    return [
+        f"gate: {second} is worse in {d.metric} on {d.split}: {d.second_mean:.4g} after "
+        f"{d.first_mean:.4g} {comparison.units[d.metric]}".rstrip()
+        for d in tested
+        if d.winner == first
+    ]
+
+
 def _compared(summary: Summary) -> list[str]:
     return [name for name, info in summary.metrics.items() if info.right is None]
 

@@ -210,6 +210,43 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, runs, capsys, monk
     }
 
 
+@pytest.mark.parametrize(
+    ("pair", "gate", "code", "said"),
+    [
+        (("better", "base"), ["--gate"], 1, "gate: base is worse in mse on ind_test"),
+        (("better", "base"), ["--gate", "psnr"], 1, "gate: base is worse in psnr on ind_test"),
+        (("base", "better"), ["--gate"], 0, "not significantly worse"),
+        (("base", "like"), ["--gate", "psnr,mse"], 0, "not significantly worse"),
+        (("better", "base"), [], 0, "B: base"),
+    ],
+)
+def test_the_gate_fails_only_if_the_second_run_is_worse(runs, capsys, pair, gate, code, said):
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", *(str(runs / name) for name in pair), "--split", "ind_test", *gate])
+    shown = capsys.readouterr().out
+    assert ended.value.code == code
+    assert said in shown
+    if gate[1:] == ["psnr"]:
+        assert "mse" not in shown
+        assert "1 comparison (Holm)" in shown  # others cost the gate no power
+
+
+def test_a_gate_that_cannot_tell_does_not_open(tmp_path, runs, capsys):
+    few = [
+        str(synthetic.run(tmp_path / name, synthetic.clips(scores[:3])))
+        for name, scores in (("a", BETTER), ("b", BASE))
+    ]
+    for words, said in (
+        ([*few, "--gate"], "too few episodes to tell whether b is worse than a"),
+        ([*few, str(runs / "like"), "--gate"], "--gate compares two runs"),
+        ([*few, "--metric", "mse", "--gate", "psnr"], "--gate compares two runs"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(["compare", *words])
+        assert ended.value.code == 2
+        assert said in capsys.readouterr().err
+
+
 METRICS = {"long_name_of_a_metric_of_some_plugin": "", "psnr": "dB", "contact_precision": ""}
 
 
