@@ -2,14 +2,14 @@
 
 Of several actions to a frame, targets such as positions act by their value at the frame, and
 velocities, forces and steps by their sum over the frame. Which of the two a source means is often
-nowhere in it, so both are read from the changes of the video, as `following` reads actions.
+nowhere in it, so it is found by what can be read from the changes of the video.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -23,7 +23,7 @@ SOURCE = "action_rate"
 
 SHIFTS = range(-2, 3)
 COUNTS = ("", "", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-ALSO = "--action-kind absolute, velocity, torque or delta"
+ALSO = "--action-kind velocity, torque or delta"
 
 Followed = Literal["value", "sum", ""]
 
@@ -39,7 +39,8 @@ class ActionRate:
         stated: whether the user or the source says so. If not, they were held.
         follows: what the video follows if it is not stated: the value at a frame or the sum over
             it; empty if that cannot be told.
-        told: the shares of the value, and of the sum, that can be read from the frames.
+        told: the shares of the value (or of its change, if the video follows the value), and of
+            the sum, that can be read from the frames.
     """
 
     per_frame: tuple[float, float]
@@ -68,20 +69,20 @@ class ActionRate:
     def question(self) -> str:
         """What is to be decided, if it `is_open`."""
         value, total = (f"{100 * share:.0f} %" for share in self.told)
-        shares = f"{total} of the sum is read from the frames, {value} of the value"
         if self.follows == "sum":
             return (
                 "the video follows their sum over a frame rather than the value that was "
-                f"used ({shares}): are they velocities or forces? Import again with --action-kind "
-                "velocity, torque "
-                "or delta, or with absolute if they are targets that the robot reaches late"
+                f"used ({total} of the sum is read from the frames, {value} of the value): are "
+                "they velocities or forces? Import again with --action-kind velocity, torque or "
+                "delta, or with absolute if they are targets that the robot reaches late"
             )
         if self.follows == "value":
             return (
-                f"the video follows their values rather than their sum over a frame ({shares}): if "
-                f"they are targets, give --action-kind absolute; velocities or forces? {ALSO}"
+                "the video moves as their values change, as targets make it "
+                f"({value} of the change is read from the frames, {total} of the sum over a "
+                f"frame): give --action-kind absolute if they are targets; else {ALSO}"
             )
-        return f"velocities or forces? Import again with {ALSO}"
+        return f"velocities or forces? Import again with {ALSO}, or with absolute for targets"
 
     @property
     def _fast(self) -> str:
@@ -140,37 +141,43 @@ def followed(
 ) -> tuple[Followed, tuple[float, float]]:
     """Whether videos follow the values of actions at the frames or their sums over the frames.
 
+    A target moves what follows it by as much as the target itself moves, so what is read of it from
+    the change of frames is how much the value changes. Velocities, steps and forces are read as
+    they are, and better as sums than by the value at one instant.
+
     Args:
         values: stretches with the value that holds at each frame.
         sums: the same stretches with the mean until the next frame.
 
     Returns:
-        Which, empty if it cannot be told; and the shares of either that are read from the frames.
-        Sums are read better as a whole, of forces too, which act late; values are read better in
-        what is new in them.
+        Which, empty if it cannot be told; and the shares of the value, or of its change if that is
+        read best, and of the sum that are read from the frames.
     """
-    least = 2 * SHIFTS[-1] + BEFORE + 4
+    least = 2 * SHIFTS[-1] + BEFORE + 5
     pairs = [pair for pair in zip(values, sums, strict=True) if len(pair[0].actions) >= least]
     if len(pairs) < FEWEST:
         return "", (0.0, 0.0)
-    sides = [list(side) for side in zip(*pairs, strict=True)]
-    varies = varying(sides[0]) & varying(sides[1])
+    held, summed = ([_shortened(side) for side in sides] for sides in zip(*pairs, strict=True))
+    changes = [replace(pair[0], actions=np.diff(pair[0].actions, axis=0)) for pair in pairs]
+    changes = [replace(side, frames=side.frames[:-1]) for side in changes]
+    varies = varying(held) & varying(summed) & varying(changes)
     if not varies.any():
         return "", (0.0, 0.0)
-    seen = [Seen(side, varies, SHIFTS[-1]) for side in sides]
-    whole = _shares([np.stack([side.plain(shift) for shift in SHIFTS]) for side in seen])
-    news = _shares([np.stack([side.new(shift) for shift in SHIFTS]) for side in seen])
-    limit = float(stats.t.isf(CERTAIN / 2, whole.shape[1] - 1))
-    more, newer = whole[1] - whole[0], news[1] - news[0]
-    if _size(more) > limit and more.mean() > LEAST:
-        return "sum", _means(whole)
-    if _size(newer) < -limit and newer.mean() < -LEAST and _size(more) < 1:
-        return "value", _means(news)
-    return "", _means(whole)
+    seen = [Seen(side, varies, SHIFTS[-1]) for side in (held, summed, changes)]
+    parts = [np.stack([side.moved(shift) for shift in SHIFTS]) for side in seen]
+    value, total, change = _shares(parts)
+    if change.mean() > value.mean() and _exceeds(change, total):
+        return "value", _percent(change, total)
+    return "sum" if _exceeds(total, value) else "", _percent(value, total)
+
+
+def _shortened(stretch: Moments) -> Moments:
+    """A stretch without its last frame, before which no value changes."""
+    return replace(stretch, frames=stretch.frames[:-1], actions=stretch.actions[:-1])
 
 
 def _shares(parts: Sequence[Numbers]) -> Numbers:
-    """What is read of the value and of the sum by each group, at the best shift of either.
+    """What each group's frames tell of each of `parts`, ``[part, group]``, at its best shift.
 
     Args:
         parts: of each ``[shift, action, group]``.
@@ -181,12 +188,14 @@ def _shares(parts: Sequence[Numbers]) -> Numbers:
     return np.stack([row[int(row.mean(1).argmax())] for row in rows])
 
 
-def _means(shares: Numbers) -> tuple[float, float]:
-    value, total = np.clip(shares.mean(1), 0, 1).tolist()
-    return value, total
+def _percent(value: Numbers, total: Numbers) -> tuple[float, float]:
+    first, second = np.clip([value.mean(), total.mean()], 0, 1).tolist()
+    return first, second
 
 
-def _size(values: Numbers) -> float:
-    """The mean in standard errors."""
-    error = values.std(ddof=1) / np.sqrt(len(values))
-    return float(values.mean() / max(error, 1e-12))
+def _exceeds(more: Numbers, less: Numbers) -> bool:
+    """Whether shares of groups are greater than others, by more than chance would make them."""
+    gain = more - less
+    error = gain.std(ddof=1) / np.sqrt(len(gain))
+    limit = float(stats.t.isf(CERTAIN / 2, len(gain) - 1))
+    return bool(gain.mean() > LEAST and gain.mean() > limit * max(float(error), 1e-12))

@@ -117,7 +117,6 @@ class Seen:
         moments: Sequence[Moments],
         varies: NDArray[np.bool_],
         reach: int,
-        changes_read: int = 1,
     ) -> None:
         self.rows = [np.arange(reach + BEFORE, len(m.actions) - reach) for m in moments]
         self.actions = standard([m.actions[:, varies].astype(np.float64) for m in moments])
@@ -129,13 +128,7 @@ class Seen:
             for c, p in zip(changes, places, strict=True)
         ]
         both = [np.concatenate(pair, 1) for pair in zip(changes, turned, strict=True)]
-        nexts = range(changes_read)
-        self.change = standard(
-            [
-                np.concatenate([b[r + n] for n in nexts], 1)
-                for b, r in zip(both, self.rows, strict=True)
-            ]
-        )
+        self.change = standard([b[r] for b, r in zip(both, self.rows, strict=True)])
         self.place = [p[r] for p, r in zip(places, self.rows, strict=True)]
         self.past = [
             np.concatenate([_clock(m.start + r), p, b[r - 1], c[r - 2]], 1)
@@ -149,6 +142,11 @@ class Seen:
         ones = [np.ones((len(change), 1)) for change in self.change]
         inputs = [np.concatenate(pair, 1) for pair in zip(self.change, self.place, strict=True)]
         return gains(ones, inputs, standard(self._actions(shift)), self.groups, self.others)
+
+    def moved(self, shift: int) -> Numbers:
+        """How well they are read by changes beyond what the picture tells, ``[action, group]``."""
+        known = [np.concatenate([np.ones((len(place), 1)), place], 1) for place in self.place]
+        return gains(known, self.change, standard(self._actions(shift)), self.groups, self.others)
 
     def new(self, shift: int) -> Numbers:
         """How well what was new in them is read, ``[action, group]``."""

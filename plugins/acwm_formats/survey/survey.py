@@ -189,7 +189,8 @@ def _of_following(survey: Survey) -> Iterator[Finding]:
         why = (
             f"in {seen.episodes} episodes, frames show no more of their own actions than of others"
         )
-        yield Finding("bad", f"{says}: {why}; a model would learn to ignore them")
+        first = "; state their kind first" if survey.rate and survey.rate.is_open else ""
+        yield Finding("bad", f"{says}: {why}; a model would learn to ignore them{first}")
     elif survey.rate and survey.rate.is_open:
         yield Finding("note", says)
     elif seen.delay is None:
