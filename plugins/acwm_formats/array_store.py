@@ -45,8 +45,8 @@ class ArrayStore(ABC):
         """One row as an image, or as the file of a picture."""
         return self.rows(name, index, index + 1)[0]
 
-    def description(self) -> tuple[dict[str, Any], Labels | None]:
-        """Facts of the episode, and labels of its frames."""
+    def description(self, episode: StoredEpisode) -> tuple[dict[str, Any], Labels | None]:
+        """Facts of one of its episodes, and labels of the frames."""
         return {}, None
 
 
@@ -87,12 +87,14 @@ class StoredEpisode:
     Attributes:
         arrays: the arrays that it is in.
         number: its number among the episodes in the same arrays; None if it is the only one.
+        count: how many these are.
         start, stop: its rows; all by default.
         problem: why it cannot be opened; empty if it can.
     """
 
     arrays: ArrayStore
     number: int | None = None
+    count: int = 1
     start: int = 0
     stop: int | None = None
     problem: str = ""
@@ -145,7 +147,7 @@ class StoredEpisodes:
             cameras = {
                 camera: self._frames(episode, name) for camera, name in self.layout.cameras.items()
             }
-            facts, labels = arrays.description()
+            facts, labels = arrays.description(episode)
         return TimedRecording(
             episode.title, cameras, actions, states, self.rate, facts=facts, labels=labels
         )

@@ -44,13 +44,13 @@ from acwm_formats.names import (
     is_action,
     natural,
     pair,
-    text_note,
     typed,
     unread_note,
     word,
     words,
 )
 from acwm_formats.sources import guarded
+from acwm_formats.texts import text_note
 from acwm_formats.timeline import (
     ActionFacts,
     RecordedDataset,
@@ -286,7 +286,7 @@ def _episodes(
     if bounds is None:
         yield StoredEpisode(arrays)
     for number, (start, stop) in enumerate(bounds or ()):
-        yield StoredEpisode(arrays, number, start, stop)
+        yield StoredEpisode(arrays, number, len(bounds or ()), start, stop)
 
 
 def _bounds(group: Any, layout: ArrayLayout, *, alone: bool) -> Bounds | None:

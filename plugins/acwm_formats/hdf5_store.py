@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,12 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError
 from acwm_core.files import parse_json
-from acwm_formats.array_store import ArrayStore
+from acwm_formats.array_store import ArrayStore, StoredEpisode
+from acwm_formats.episode_bounds import INDEX
 from acwm_formats.frames import file_stamp
 from acwm_formats.hdf5_layouts import array, open_hdf5, values_of
 from acwm_formats.labels import Labels
-
-LONGEST = 1000  # characters of a text that is kept
+from acwm_formats.texts import LONGEST, Fact, text_facts
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,11 @@ class HDF5Group(ArrayStore):
             return image
         return image.tobytes() if image.ndim == 1 and image.dtype == np.uint8 else image
 
-    def description(self) -> tuple[dict[str, Any], Labels | None]:
+    def description(self, episode: StoredEpisode) -> tuple[dict[str, Any], Labels | None]:
         """As in `ArrayStore`."""
         group = self.group
         if group.file.attrs.get("format") != "acwm":
-            return texts(group), None
+            return _texts(group, episode), None
         contacts = np.asarray(values_of(array(group, "contacts")), np.int32).reshape(-1, 3)
         return _facts(group), Labels(self.images("masks"), contacts)
 
@@ -89,27 +90,44 @@ def _facts(group: Any) -> dict[str, Any]:
     return {name: value for name, value in simulated.items() if value} | facts
 
 
-def texts(group: Any) -> dict[str, str]:
-    """The texts that describe an episode: attributes of its group, and arrays of one text.
+def _texts(group: Any, episode: StoredEpisode) -> dict[str, Fact]:
+    """The texts that describe an episode: attributes of its group, and arrays.
 
-    Long ones, such as the source of a simulator's model, are left out.
+    Arrays hold one text, a text for each row, or one for each of several episodes in a row. They
+    lie beside the numbers or in a group there, such as ``obs``, or in one that describes episodes.
     """
-    texts: dict[str, str] = {}
-    items = [*group.attrs.items()] + [
-        (name, values_of(item) if item.ndim == 0 else values_of(item)[0])
-        for name, item in group.items()
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "SO" and item.size == 1
-    ]
+    values = {name: [value] for name, value in group.attrs.items()}
     try:  # of LIBERO, where it is the same for all
         problem = parse_json(group.parent.attrs["problem_info"])
-        items.append(("language_instruction", problem["language_instruction"]))
+        values["language_instruction"] = [problem["language_instruction"]]
     except (KeyError, TypeError, ValueError):
         pass
-    for name, value in items:
-        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-        if isinstance(text, str) and 0 < len(text) <= LONGEST:
-            texts[name] = text
-    return texts
+    several = episode.number is not None
+    around = (group.parent, group.file) if several else ()
+    for place in (group, *(place[n] for place in around for n in INDEX if n in place)):
+        for name, item in _strings(place):
+            if item.ndim == 0:
+                values.setdefault(name, [values_of(item)])
+            elif len(item) == 1 and not several:
+                values.setdefault(name, [*values_of(item)])
+            elif several and len(item) == episode.count:
+                values.setdefault(name, [values_of(item)[episode.number]])
+            elif place is group and len(item) >= (episode.stop or 0):
+                values.setdefault(name, [*values_of(item, slice(episode.start, episode.stop))])
+    return text_facts(values)
+
+
+def _strings(group: Any) -> Iterator[tuple[str, Any]]:
+    """The arrays of texts in a group and in those directly below it, by their names."""
+    if not isinstance(group, h5py.Group):
+        return
+    below = [item for item in group.values() if isinstance(item, h5py.Group)]
+    for place in (group, *below):
+        for name, item in place.items():
+            if isinstance(item, h5py.Dataset) and item.ndim < 2:
+                is_text = h5py.check_string_dtype(item.dtype) is not None
+                if is_text and item.dtype.itemsize <= 4 * LONGEST:  # pictures may be strings, too
+                    yield name, item
 
 
 def shared_file(path: Path, within: Path | None) -> Any:

@@ -32,8 +32,9 @@ from acwm_formats.lerobot_layout import (
     read_info,
     read_places,
 )
-from acwm_formats.names import is_action, text_note, word, words
+from acwm_formats.names import is_action, word, words
 from acwm_formats.sources import damage_of, guarded
+from acwm_formats.texts import text_facts, text_note
 from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
 
 FRAME, REWARD = "frame_index", "next.reward"
@@ -86,6 +87,7 @@ class LeRobot(Format):
         empty = _empty(places[0], [field.name for field in observed])
         state = tuple(field for field in observed if field.name not in empty)
         unused = _unused(features, (*acting, *(field.name for field in observed)))
+        texts = [*["tasks"] * any(p.tasks for p in places), *places[0].texts, *_texts(features)]
         return RecordedDataset(
             name or word(root),
             LeRobotRecordings(root, acting, tuple(field.name for field in state)),
@@ -95,7 +97,7 @@ class LeRobot(Format):
             options={"actions": actions, "follow_links": follow_links},
             actions=_action(features, acting, ours),
             state=state,
-            notes=(*_notes(acting, unused, empty, places),) if not ours else (),
+            notes=(*_notes(acting, unused, empty, texts),) if not ours else (),
             summary=ours.summary if ours else f"{info.get('robot_type') or 'a robot'}",
         )
 
@@ -148,13 +150,14 @@ class LeRobotRecordings:
         whole = _index(self.root)
         place = whole.places[index]
         rewards = [REWARD] if REWARD in whole.features else []
-        names = [FRAME, *self.actions, *self.states, *rewards]
-        table = read_columns(place.data, names, place.episode)
+        names, texts = [FRAME, *self.actions, *self.states, *rewards], _texts(whole.features)
+        table = read_columns(place.data, [*names, *texts], place.episode)
         columns = {name: _numbers(table, name) for name in names}
         actions = np.concatenate([columns[name] for name in self.actions], axis=1)
         numbers = columns[FRAME][:, 0].astype(np.int64)
         cameras = _Cameras(tuple(_cameras(whole.features)), index, self.root, numbers / whole.fps)
         facts: dict[str, Any] = {"episode": place.episode, "tasks": list(place.tasks)}
+        facts |= {**place.texts, **text_facts({n: table.column(n).to_pylist() for n in texts})}
         if rewards:
             facts["rewards"] = columns[REWARD].reshape(-1).tolist()
         return TimedRecording(
@@ -339,6 +342,10 @@ def _action_names(
     )
 
 
+def _texts(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return [name for name, feature in features.items() if feature.get("dtype") == "string"]
+
+
 def _is_numeric(feature: Mapping[str, Any]) -> bool:
     return re.fullmatch(r"(float|u?int)\d+|bool", str(feature.get("dtype"))) is not None
 
@@ -353,7 +360,7 @@ def _empty(place: EpisodeFiles, names: Sequence[str]) -> list[str]:
 
 
 def _unused(features: Mapping[str, Mapping[str, Any]], used: Sequence[str]) -> list[str]:
-    known = (*COLUMNS, *used, REWARD, *_cameras(features))
+    known = (*COLUMNS, *used, REWARD, *_cameras(features), *_texts(features))
     return [name for name in features if name not in known]
 
 
@@ -361,7 +368,7 @@ def _notes(
     acting: Sequence[str],
     unused: Sequence[str],
     empty: Sequence[str],
-    places: Sequence[EpisodeFiles],
+    texts: Sequence[str],
 ) -> Iterator[str]:
     """What people should know about how the dataset was read."""
     if acting != (ACTION,):
@@ -371,7 +378,7 @@ def _notes(
         yield f"Features that were left out: {', '.join(unused)}."
     if empty:
         yield f"Features that were left out because they are null: {', '.join(empty)}."
-    yield from text_note(["tasks"]) if any(place.tasks for place in places) else ()
+    yield from text_note(texts)
 
 
 def _action(

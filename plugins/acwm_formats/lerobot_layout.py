@@ -21,6 +21,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, parse_json
 from acwm_formats.tables import parquet_file, read_parquet
+from acwm_formats.texts import Fact, text_facts
 
 arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -64,6 +65,7 @@ class EpisodeFiles(NamedTuple):
         data: the parquet file with its rows.
         videos: for each camera whose frames are not in the rows, where these are.
         tasks: what was to be done.
+        texts: what else the index of episodes says of it in words.
     """
 
     episode: int
@@ -71,6 +73,7 @@ class EpisodeFiles(NamedTuple):
     data: Path
     videos: dict[str, Shown]
     tasks: tuple[str, ...] = ()
+    texts: Mapping[str, Fact] = {}
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -183,13 +186,18 @@ def _place(
 ) -> EpisodeFiles:
     episode, length = int(row["episode_index"]), int(row["length"])
     tasks = tuple(map(str, row.get("tasks") or ()))
+    texts = text_facts(
+        {n: v if isinstance(v, list) else [v] for n, v in row.items() if n != "tasks"}
+    )
     videos: dict[str, Shown] = {}
     if "chunk" in row:  # version 2
         names = {"episode_chunk": row["chunk"], "episode_index": episode}
         for camera in filmed:
             path = _path(root, info["video_path"], {**names, "video_key": camera})
             videos[camera] = Shown(path)
-        return EpisodeFiles(episode, length, _path(root, info["data_path"], names), videos, tasks)
+        return EpisodeFiles(
+            episode, length, _path(root, info["data_path"], names), videos, tasks, texts
+        )
 
     def numbers(prefix: str) -> dict[str, Any]:
         return {key: int(row[f"{prefix}/{key}"]) for key in ("chunk_index", "file_index")}
@@ -201,7 +209,7 @@ def _place(
         start = float(row[f"{key}/from_timestamp"])
         videos[camera] = Shown(path, start, None if end is None else float(end))
     return EpisodeFiles(
-        episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks
+        episode, length, _path(root, info["data_path"], numbers("data")), videos, tasks, texts
     )
 
 

@@ -22,9 +22,18 @@ from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp
 from acwm_formats.mcap_clocks import Stamps, TopicClock, clock_note, times_of
 from acwm_formats.mcap_images import CameraMessages, is_image, is_video
-from acwm_formats.mcap_messages import MAGIC, NumberMessages, Numbers, entries, topics
+from acwm_formats.mcap_messages import (
+    MAGIC,
+    NumberMessages,
+    Numbers,
+    TextMessages,
+    descriptions,
+    entries,
+    topics,
+)
 from acwm_formats.names import unread_note, word, words
 from acwm_formats.sources import damage_of, files_in, guarded
+from acwm_formats.texts import Fact, text_note
 from acwm_formats.timeline import (
     ActionFacts,
     RecordedDataset,
@@ -42,12 +51,14 @@ class Log(NamedTuple):
         actions: the topic of actions, perhaps followed by a colon and a field.
         states: topics of states, in the same way.
         stamps: whose times to take.
+        texts: topics that may hold texts, which are kept as facts.
     """
 
     cameras: tuple[str, ...]
     actions: str
     states: tuple[str, ...]
     stamps: Stamps | None = None
+    texts: tuple[str, ...] = ()
 
 
 class MCAP(Format):
@@ -101,8 +112,9 @@ class MCAP(Format):
             if topic not in kinds:
                 raise DataError(f"{first} has no topic {topic!r}{suggest(topic, kinds)}")
         wanted, numbers = _actions(first, actions, [t for t in kinds if t not in filmed])
-        log = Log(cameras, wanted, words(states), stamps)
         used = {*cameras, wanted.partition(":")[0], *asked}
+        others = [topic for topic in kinds if topic not in used]
+        log = Log(cameras, wanted, words(states), stamps, _text_topics(first, others))
         return RecordedDataset(
             name=word(root),
             splits=Logs(tuple(files), log),
@@ -111,7 +123,7 @@ class MCAP(Format):
             options={"video": video, "actions": actions, "states": states, "stamps": stamps}
             | {"follow_links": follow_links},
             actions=ActionFacts(numbers.names),
-            notes=_notes(first, log, [topic for topic in kinds if topic not in used])
+            notes=_notes(first, log, [topic for topic in others if topic not in log.texts])
             + tuple(unread_note(root, files)),
             summary=f"Logs of {root.resolve().name}",
         )
@@ -146,7 +158,7 @@ class Logs:
             return self._opened(path, log)
 
     def _opened(self, path: Path, log: Log) -> TimedRecording:
-        cameras, columns = _read(path, log)
+        cameras, columns, texts = _read(path, log)
         numbers = {name: column.numbers() for name, column in columns.items()}
         times = times_of(_clocks(cameras, numbers), log.stamps)
         zero = min(
@@ -161,16 +173,33 @@ class Logs:
             {_name(c.topic): _frames(path, c, (times[c.topic] - zero) / 1e9) for c in cameras},
             samples(log.actions),
             {_name(name): samples(name) for name in log.states},
+            facts=texts,
             length=cameras[0].logged if cameras[0].logged > len(cameras[0].times) else None,
         )
 
 
-def _read(path: Path, log: Log) -> tuple[list[CameraMessages], dict[str, NumberMessages]]:
-    """What a file holds of the topics that are asked for."""
+def _read(
+    path: Path, log: Log
+) -> tuple[list[CameraMessages], dict[str, NumberMessages], dict[str, Fact]]:
+    """What a file holds of the topics that are asked for, and what it says in words."""
     cameras = [CameraMessages(topic) for topic in log.cameras]
     columns = {name: NumberMessages(name) for name in (log.actions, *log.states)}
-    _gathered(path, cameras, columns)
-    return cameras, columns
+    texts = [TextMessages(topic) for topic in log.texts]
+    _gathered(path, (*cameras, *columns.values(), *texts))
+    said = descriptions(path)
+    for topic in texts:
+        said |= topic.facts()
+    return cameras, columns, said
+
+
+def _text_topics(path: Path, others: Sequence[str]) -> tuple[str, ...]:
+    """The topics that hold texts and no numbers, by their first messages."""
+    known: dict[str, TextMessages] = {}
+    for entry in entries(path, others) if others else ():
+        if entry.topic not in known:
+            known[entry.topic] = TextMessages(entry.topic)
+            known[entry.topic].add(entry)
+    return tuple(topic for topic, texts in known.items() if texts.facts())
 
 
 def _clocks(
@@ -182,7 +211,7 @@ def _clocks(
 
 def _notes(path: Path, log: Log, others: Sequence[str]) -> tuple[str, ...]:
     """What people should know about how the logs were read, by the first."""
-    cameras, columns = _read(path, log)
+    cameras, columns, texts = _read(path, log)
     known: dict[str, Numbers] = {}
     with contextlib.suppress(DataError):  # opening it will tell
         known = {name: column.numbers() for name, column in columns.items()}
@@ -190,15 +219,15 @@ def _notes(path: Path, log: Log, others: Sequence[str]) -> tuple[str, ...]:
     notes = [f"Actions are {log.actions}; {note}."]
     if others:
         notes.append(f"Topics that were left out: {', '.join(others)}.")
-    return tuple(notes)
+    return (*notes, *text_note(texts))
 
 
 def _gathered(
-    path: Path, cameras: Sequence[CameraMessages], columns: Mapping[str, NumberMessages]
+    path: Path, gatherers: Sequence[CameraMessages | NumberMessages | TextMessages]
 ) -> None:
     """Give each message of the file to those who gather its topic, in one scan."""
-    by_topic: dict[str, list[CameraMessages | NumberMessages]] = {}
-    for gatherer in (*cameras, *columns.values()):
+    by_topic: dict[str, list[CameraMessages | NumberMessages | TextMessages]] = {}
+    for gatherer in gatherers:
         by_topic.setdefault(gatherer.topic, []).append(gatherer)
     for entry in entries(path, list(by_topic)):
         for gatherer in by_topic[entry.topic]:
@@ -225,7 +254,7 @@ def _files(path: Path) -> list[Path]:
 def _actions(path: Path, wanted: str | None, others: Sequence[str]) -> tuple[str, Numbers]:
     """The topic of actions, which is wanted or the only one with numbers, and its numbers."""
     columns = {name: NumberMessages(name) for name in ([wanted] if wanted else others)}
-    _gathered(path, (), columns)
+    _gathered(path, [*columns.values()])
     if wanted:
         return wanted, columns[wanted].numbers()
     topics = [name for name, column in columns.items() if column.rows and column.problem is None]

@@ -25,6 +25,7 @@ from acwm_core.errors import DataError
 from acwm_core.files import check_fetched, parse_json
 from acwm_formats.frames import file_stamp
 from acwm_formats.packed import check_packed
+from acwm_formats.texts import Fact, text_facts
 
 MAGIC = b"\x89MCAP0\r\n"
 """The first and the last bytes of a file."""
@@ -38,6 +39,9 @@ compression's name, which follows."""
 
 UNNUMBERED = ("header", "stamp", "timestamp", "layout", "name", "frame_id")
 """Fields of messages that hold no action."""
+
+
+NUMBERS = (bool, int, float, np.number)
 
 
 class Numbers(NamedTuple):
@@ -200,7 +204,7 @@ class NumberMessages:
 
     def _add(self, entry: LoggedMessage) -> None:
         content, asked = entry.content(), self.name.partition(":")[2]
-        leaves = dict(_leaves(content))
+        leaves = {name: float(number) for name, number in _leaves(content)}
         if asked:
             leaves = {n: v for n, v in leaves.items() if re.split(r"[.\[]", n)[0] == asked}
         if not leaves:
@@ -229,6 +233,44 @@ class NumberMessages:
         return Numbers(self.names, times, stamps, np.array(self.rows))
 
 
+@dataclass
+class TextMessages:
+    """Gathers the texts of a topic, by field; it says nothing if messages hold numbers, too."""
+
+    topic: str
+    texts: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    numeric: bool = False
+
+    def add(self, entry: LoggedMessage) -> None:
+        """Add the texts of a message."""
+        if self.numeric:
+            return
+        with contextlib.suppress(DataError):  # nobody asked for it
+            content = entry.content()
+            self.numeric = next(_leaves(content), None) is not None
+            for name, text in () if self.numeric else _leaves(content, kinds=(str,)):
+                self.texts.setdefault(name, []).append(text)
+
+    def facts(self) -> dict[str, Fact]:
+        """What it says, by the name of the topic, and of the field if there are several."""
+        title = self.topic.strip("/").replace("/", ".")
+        one = len(self.texts) == 1
+        named = {title if one else f"{title}.{name}": t for name, t in self.texts.items()}
+        return {} if self.numeric else text_facts(named)
+
+
+def descriptions(path: Path) -> dict[str, Fact]:
+    """The texts in a file's records of metadata.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    with _opened(path) as reader:
+        records = [(record.name, record.metadata) for record in reader.iter_metadata()]
+    known = {f"{name}.{key}": [text] for name, texts in records for key, text in texts.items()}
+    return text_facts(known)
+
+
 def stamp_of(message: Any) -> int:
     """The time in the header of a message, or in its field `timestamp`, in ns; 0 if it has none."""
     header = content_of(message, "header") if _fields(message) is not None else None
@@ -251,19 +293,19 @@ def _nanoseconds(time: Any) -> int | None:
     return None if parts[0] is None else parts[0] * 10**9 + (parts[1] or 0)
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers in a message, by their path in it."""
-    if isinstance(value, bool | int | float | np.number):
-        yield name, float(value)
-    elif isinstance(value, str | bytes) or value is None:
+def _leaves(value: Any, name: str = "", kinds: tuple[type, ...] = NUMBERS) -> Iterator[Any]:
+    """The numbers in a message, or what else it holds of some kinds, by their path in it."""
+    if isinstance(value, kinds):
+        yield name, value
+    elif isinstance(value, (str, bytes, *NUMBERS)) or value is None:
         return
     elif (fields := _fields(value)) is not None:
         for key in fields:
             if key not in UNNUMBERED:
-                yield from _leaves(content_of(value, key), f"{name}.{key}".lstrip("."))
+                yield from _leaves(content_of(value, key), f"{name}.{key}".lstrip("."), kinds)
     else:
         for place, entry in enumerate(value):
-            yield from _leaves(entry, f"{name}[{place}]")
+            yield from _leaves(entry, f"{name}[{place}]", kinds)
 
 
 def _fields(message: Any) -> list[str] | None:

@@ -30,9 +30,10 @@ from acwm_formats.frames import ImageFrames, Images, file_stamp, regular_times, 
 from acwm_formats.hdf5_layouts import array, values_of
 from acwm_formats.hdf5_store import HDF5Group, shared_file
 from acwm_formats.images import CHANNELS
-from acwm_formats.names import exact, natural, pair, text_note, typed, word
+from acwm_formats.names import exact, natural, pair, typed, word
 from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.tables import MOST_COLUMNS, read_parquet
+from acwm_formats.texts import text_facts, text_note
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
 METADATA = "metadata.json"
@@ -164,9 +165,10 @@ class MinariRecordings:
             }
             actions = Samples(_vectors(taken, stored.actions))
             count = len(next(iter(cameras.values())).images)
+            facts = text_facts({n: rows for n, rows in seen.items() if isinstance(rows, list)})
             notes = (SAME_COUNT,) if len(actions.values) == count else ()
             return TimedRecording(
-                title, cameras, actions, states, self.rate, facts=_texts(seen), notes=notes
+                title, cameras, actions, states, self.rate, facts=facts, notes=notes
             )
 
     def _frames(self, images: Images, name: str, index: int) -> ImageFrames:
@@ -174,16 +176,6 @@ class MinariRecordings:
         stamp = f"{index} {name} {file_stamp(_data(self.root) / METADATA)}"
         channels = named(name, self.channels)
         return ImageFrames(images, times, self.pixel_range, channels=channels, stamp=stamp)
-
-
-def _texts(seen: Mapping[str, Any]) -> dict[str, Any]:
-    """Observed texts: one, or those that follow each other."""
-    facts: dict[str, Any] = {}
-    for name, values in seen.items():
-        if isinstance(values, list) and all(isinstance(text, str) for text in values):
-            texts = list(dict.fromkeys(values))
-            facts[name] = texts[0] if len(texts) == 1 else texts
-    return facts
 
 
 def _notes(recordings: MinariRecordings, others: Sequence[str]) -> tuple[str, ...]:

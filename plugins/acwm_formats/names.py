@@ -41,13 +41,6 @@ def is_action(name: str) -> bool:
     return re.match(r"actions?(\W|_|\d|$)", name.lower()) is not None
 
 
-def text_note(facts: Iterable[str]) -> list[str]:
-    """A sentence for people about texts that were kept; none if there are none."""
-    names = ", ".join(facts)
-    kept = f"Texts were kept as facts of the episodes: {names}. No model reads them."
-    return [kept] if names else []
-
-
 def unread_note(root: Path, used: Iterable[Path]) -> list[str]:
     """A sentence for people about what else lies in the folder `root`; none if nothing does."""
     if not root.is_dir():

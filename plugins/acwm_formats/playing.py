@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.errors import DataError
+from acwm_formats.texts import text_facts
 from acwm_formats.timeline import Recording
 
 OBSERVATION = "observation"
@@ -147,6 +148,7 @@ class Take:
         space: of the actions.
         rng: the random generator of the policy.
         limit: most frames.
+        said: texts among the observations, by name.
     """
 
     policy: Policy | None
@@ -156,6 +158,7 @@ class Take:
     images: list[NDArray[np.uint8]] = field(default_factory=list[NDArray[np.uint8]])
     taken: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
     seen: list[NDArray[Any]] = field(default_factory=list[NDArray[Any]])
+    said: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     ended: bool = False
     action: Any = None  # the last one
 
@@ -171,6 +174,10 @@ class Take:
         if self.images:
             self.taken.append(_vector(self.space, self.action))
         self.images.append(_frame(image))
+        parts: Any = observation if isinstance(observation, dict) else {OBSERVATION: observation}
+        for name, value in parts.items():
+            if isinstance(value, str):
+                self.said.setdefault(name, []).append(value)
         self.seen.append(np.array(observation))
 
     def recording(self, space: Any) -> Recording:
@@ -190,7 +197,8 @@ class Take:
         states = {OBSERVATION: np.stack(self.seen)} if vectors else {}
         if not self.taken:
             raise DataError("it ends before a second frame is shown")
-        return Recording(np.stack(self.images), np.stack(self.taken), states)
+        frames, facts = np.stack(self.images), text_facts(self.said)
+        return Recording(frames, np.stack(self.taken), states, facts=facts)
 
 
 def play(

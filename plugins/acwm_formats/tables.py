@@ -66,7 +66,7 @@ def read_table(path: Path) -> Table:
     check_fetched(path)
     columns: dict[str, NDArray[Any]] = {}
     try:
-        rows = READERS[path.suffix.lower()](path)
+        rows = _spread(READERS[path.suffix.lower()](path))
         _check_width(len(rows))
         for name, values in _numbered(rows, path).items():
             split = _split(composed(name), values)
@@ -161,6 +161,16 @@ def _is_episode(name: str) -> bool:
 def action_columns(table: Table) -> list[str]:
     """The columns that are neither times nor numbers of frames or episodes."""
     return [n for n in table if _bare(n) not in (*TIMES, *FRAMES) and not _is_episode(n)]
+
+
+def _spread(rows: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The columns, with a text that stands once, as in NPZ and JSON, in every row."""
+    arrays = {name: np.asarray(values) for name, values in rows.items()}
+    count = max((len(values) for values in arrays.values() if values.ndim), default=0)
+    alone = {n: v for n, v in arrays.items() if v.ndim == 0}
+    if wrong := next((name for name, value in alone.items() if value.dtype.kind not in "US"), None):
+        raise ValueError(f"{wrong} is {alone[wrong]!s:.80}, but a column has a value per row")
+    return {**rows, **{name: np.repeat(value, count) for name, value in alone.items()}}
 
 
 def _numbered(rows: Mapping[str, Any], path: Path) -> Mapping[str, Any]:

@@ -125,6 +125,7 @@ class Recording:
         action_times: when each action was taken, on the same clock. Then there may be any number of
             actions.
         channels: what three or four channels of `video` are; found out by default.
+        facts: what else is known of the episode, for JSON: its task, …
     """
 
     video: NDArray[Any]
@@ -133,6 +134,7 @@ class Recording:
     times: NDArray[np.floating[Any]] | None = None
     action_times: NDArray[np.floating[Any]] | None = None
     channels: Channels | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def timed(self, name: str, fps: float | None) -> TimedRecording:
         """The same as a `TimedRecording`, with frames at a constant rate if it has no times.
@@ -154,7 +156,7 @@ class Recording:
         stamp = hashlib.sha256(np.ascontiguousarray(video).data).hexdigest()
         frames = ImageFrames(video, times, channels=self.channels, stamp=stamp)
         actions = Samples(np.asarray(self.actions), taken)
-        return TimedRecording(name, {"video": frames}, actions, states)
+        return TimedRecording(name, {"video": frames}, actions, states, facts=self.facts)
 
 
 class Recordings(Protocol):

@@ -16,7 +16,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
-from acwm_formats.names import composed, exact, folded, is_action, text_note, word, words
+from acwm_formats.names import composed, exact, folded, is_action, word, words
 from acwm_formats.sources import VIDEOS, damage_of, files_in, guarded
 from acwm_formats.tables import (
     FRAMES,
@@ -32,6 +32,7 @@ from acwm_formats.tables import (
     seconds,
     special_column,
 )
+from acwm_formats.texts import text_facts, text_note
 from acwm_formats.timeline import (
     ActionFacts,
     Frames,
@@ -75,6 +76,7 @@ class Columns(NamedTuple):
         frame: the column of numbers of frames; None if there is none.
         episode: the column that names the episode, in a table for all.
         texts: names of the columns that hold text, which are kept as facts.
+        known: names of all columns of the table.
     """
 
     actions: tuple[str, ...]
@@ -83,6 +85,7 @@ class Columns(NamedTuple):
     frame: str | None
     episode: str | None
     texts: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
 
 
 class Videos(Format):
@@ -219,8 +222,13 @@ class VideoFolder:
         names = self.columns.states
         states = {name: samples(number_column(rows, name, path)[:, None]) for name in names}
         actions = samples(numbers(rows, self.columns.actions, path))
-        facts = {name: _text(rows[name]) for name in self.columns.texts if name in rows}
-        return TimedRecording(place.name, cameras, actions, states, rate, facts=facts)
+        others = [name for name in rows if name not in self.columns.known]
+        facts = text_facts(
+            {n: rows[n].tolist() for n in (*self.columns.texts, *others) if n in rows}
+        )
+        left = ", ".join(name for name in others if name not in facts)
+        notes = (f"columns that the first table lacks were left out: {left}",) if left else ()
+        return TimedRecording(place.name, cameras, actions, states, rate, facts=facts, notes=notes)
 
     def _rows(self, place: VideoEpisode, index: int) -> tuple[Table, Path]:
         """The rows of an episode, and the file that they are in."""
@@ -458,13 +466,7 @@ def _columns(
     episode = episode_column(table) if shared else None
     time = time or special_column(table, TIMES)
     texts = tuple(name for name in free if name not in numeric)
-    return Columns(actions, states, time, special_column(table, FRAMES), episode, texts)
-
-
-def _text(column: NDArray[Any]) -> str | list[str]:
-    """The text of an episode; a list if it changes, of each once."""
-    known = [str(value) for value in dict.fromkeys(column.tolist()) if value is not None]
-    return known[0] if len(known) == 1 else known
+    return Columns(actions, states, time, special_column(table, FRAMES), episode, texts, (*table,))
 
 
 class UnlabelledVideos(VideoFolder):

@@ -28,6 +28,7 @@ from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import exact, pair, typed, word, words
 from acwm_formats.packed import check_packed
 from acwm_formats.sources import damage_of, guarded
+from acwm_formats.texts import text_facts, text_note
 from acwm_formats.timeline import RecordedDataset
 
 ENDS = "meta/episode_ends"
@@ -46,6 +47,9 @@ NUMBERED = tuple(
 """Arrays that number the episode of each row, where no other tells episodes apart."""
 
 ACTIONS = ("action", "actions")
+NUMBERS, TEXTS = "fiub", "SUTO"
+"""NumPy's kinds of dtypes that hold numbers, and of those that may hold texts."""
+
 CODECS = (
     *(
         "blosc",
@@ -61,6 +65,7 @@ CODECS = (
     ),
     *("BloscCodec", "ZstdCodec", "GzipCodec", "BytesCodec", "TransposeCodec", "Crc32cCodec"),
     *("ShardingCodec", "imagecodecs_jpegxl", "imagecodecs_jpeg2k", "imagecodecs_webp"),
+    *("vlen-utf8", "VLenUTF8Codec"),
 )
 """Codecs of numbers and images. Others are refused: those of objects run code as they read."""
 
@@ -130,7 +135,7 @@ class ZarrReplay(Format):
             buffer.episodes(), layout, exact(rate), pair(pixel_range), channels
         )
         used = {*cameras, *action, *kept}
-        left = [name for name in (*arrays, *buffer.names("SUTO")) if name not in used]
+        left = [name for name in arrays if name not in used]
         return RecordedDataset(
             name=word(Path(root)),
             splits=recordings,
@@ -171,7 +176,8 @@ def _notes(
                 f"{array.fill_value}: a copy may lack files."
             )
     with contextlib.suppress(DataError):
-        notes += stack_note(recordings[0].cameras.values())
+        first = recordings[0]
+        notes += [*stack_note(first.cameras.values()), *text_note(first.facts)]
     return tuple(notes)
 
 
@@ -200,6 +206,7 @@ class Buffer(ArrayStore):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._found: dict[str, Any] = {}
+        self._read: dict[str, list[Any]] = {}
         with damage_of(path), _pointers_named(path):
             if path.is_file():
                 with ZipFile(path) as packed:
@@ -212,18 +219,19 @@ class Buffer(ArrayStore):
     def __reduce__(self) -> Any:
         return Buffer, (self.path,)
 
-    def names(self, kinds: str = "fiub") -> list[str]:
-        """The names of the arrays in ``data``, but of texts and hidden ones.
+    def names(self, kinds: str = NUMBERS, group: str = "data") -> list[str]:
+        """The names of the arrays in a group but for hidden ones.
 
         Args:
             kinds: which, by NumPy's kinds of dtypes.
+            group: the name of the group.
         """
-        with damage_of(self.path / "data"), _pointers_named(self.path / "data"):
-            arrays = self._group["data"].arrays()
+        with damage_of(self.path / group), _pointers_named(self.path / group):
+            arrays = self._group[group].arrays()
             return sorted(n for n, a in arrays if a.dtype.kind in kinds and not n.startswith("."))
 
     def array(self, name: str) -> Any:
-        """An array of numbers whose codecs run no code.
+        """An array of numbers or texts whose codecs run no code.
 
         Raises:
             DataError: there is no such array, or it cannot be read.
@@ -234,7 +242,7 @@ class Buffer(ArrayStore):
             array = self._group[name]
             codecs = [*array.filters, *array.compressors]
             used = [getattr(codec, "codec_id", type(codec).__name__) for codec in codecs]
-        if array.dtype.kind not in "fiub" or not {*used} <= {*CODECS}:
+        if array.dtype.kind not in NUMBERS + TEXTS or not {*used} <= {*CODECS}:
             raise DataError(f"{name} of {self.path} holds {array.dtype} by {used}, not numbers")
         chunk = math.prod(array.chunks) * array.dtype.itemsize
         if max(chunk / 2, math.prod(array.shape[1:]) * array.dtype.itemsize) > MOST_BYTES:
@@ -263,8 +271,23 @@ class Buffer(ArrayStore):
 
     def episodes(self) -> dict[int, StoredEpisode]:
         """The episodes by number; raises as `ends`."""
-        bounds = enumerate(itertools.pairwise([0, *self.ends]))
-        return {number: StoredEpisode(self, number, *rows) for number, rows in bounds}
+        bounds, count = enumerate(itertools.pairwise([0, *self.ends])), len(self.ends)
+        return {number: StoredEpisode(self, number, count, *rows) for number, rows in bounds}
+
+    def description(self, episode: StoredEpisode) -> tuple[dict[str, Any], None]:
+        """As in `ArrayStore`: texts of each row in ``data``, and of each episode in ``meta``."""
+        rows, number = slice(episode.start, episode.stop), episode.number or 0
+        own = {name: self._texts(f"data/{name}")[rows] for name in self.names(TEXTS)}
+        if "meta" in self._group:
+            known = {name: self._texts(f"meta/{name}") for name in self.names(TEXTS, "meta")}
+            own |= {n: t[number : number + 1] for n, t in known.items() if len(t) == episode.count}
+        return dict(text_facts(own)), None
+
+    def _texts(self, name: str) -> list[Any]:
+        """All texts in an array, which are read once."""
+        if name not in self._read:
+            self._read[name] = self._rows(name).reshape(-1).tolist()
+        return self._read[name]
 
     @functools.cached_property
     def ends(self) -> list[int]:

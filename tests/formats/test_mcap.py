@@ -6,9 +6,9 @@ import mcap.writer
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import SeekingReader
 
 from acwm_core.errors import DataError
-from acwm_formats import mcap_messages
 from acwm_formats.mcap_logs import MCAP
 from tests.formats.corpus import logs
 from tests.formats.corpus.cases import Case, at, episode
@@ -85,8 +85,13 @@ def test_video_that_cannot_be_read_right_is_refused(tmp_path):
 def test_a_log_is_scanned_once(tmp_path, monkeypatch):
     protobuf_log(tmp_path / "a.mcap", ["/arm", "/hand"])
     found = MCAP().read(tmp_path, actions="/arm:torque", states="/arm:force,/hand")
-    scanned, scan = [], mcap_messages.make_reader
-    monkeypatch.setattr(mcap_messages, "make_reader", lambda file: scanned.append(1) or scan(file))
+    scanned, scan = [], SeekingReader.iter_messages
+
+    def counted(reader, *args, **options):
+        scanned.append(1)
+        return scan(reader, *args, **options)
+
+    monkeypatch.setattr(SeekingReader, "iter_messages", counted)
     recording = found.splits[0]
     assert recording.states["hand"].values.tolist() == [[1, 2]]
     assert len(scanned) == 1

@@ -154,30 +154,6 @@ def test_other_files_and_rows_are_named(tmp_path):
     assert "Rows without a video: c." in notes
 
 
-def test_texts_are_kept_as_facts(tmp_path):
-    for name in "abc":
-        film(tmp_path / f"{name}.mp4", 0)
-        lines = [f"push the {name},{'reach' if k < 4 else 'push'},{k}" for k in range(8)]
-        write(tmp_path / f"{name}.csv", "\n".join(["task,phase,x", *lines]))
-    words = ["data", "import", "videos", str(tmp_path), "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(main, [*words, "--workers", "0", "--test-episodes", "1"])
-    assert done.exit_code == 0, done.output
-    said = " ".join(done.output.split())
-    assert "kept as facts of the episodes: task, phase. No model reads them." in said
-    facts = EpisodeDataset(tmp_path / "out", "train").about(1)["facts"]
-    assert facts == {"task": "push the b", "phase": ["reach", "push"]}
-
-
-def test_texts_in_hdf5_are_kept(tmp_path):
-    path, _ = arrays.libero(tmp_path, PLAIN)
-    with h5py.File(path, "a") as file:
-        file["data/demo_0"].attrs["success"] = "yes"
-        file["data/demo_0"].attrs["model_file"] = "<mujoco/>" * 1000
-    found = HDF5().read(path)
-    assert found.splits[0].facts == {"success": "yes", "language_instruction": "put it down"}
-    assert any("No model reads them" in note for note in found.notes)
-
-
 @pytest.mark.parametrize(
     ("count", "tests"), [(2, 0), (3, 2), (9, 2), (10, 5), (35, 5), (49, 5), (60, 6), (200, 20)]
 )
