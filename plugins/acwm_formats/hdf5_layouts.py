@@ -20,6 +20,7 @@ from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout
 from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, tells
 from acwm_formats.frames import MOST_FRAMES
+from acwm_formats.hdf5_chunks import check_chunks
 from acwm_formats.hdf5_links import check_references, external_links, open_plain
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import natural
@@ -82,10 +83,12 @@ def values_of(dataset: Any, rows: slice | tuple[()] = ()) -> Any:
     """What a dataset holds, or some of its rows.
 
     Raises:
-        ValueError: it claims far more than the file stores.
+        ValueError: it claims far more than the file stores, or unpacks to more than it claims.
     """
     stored = 0 if dataset.external else dataset.id.get_storage_size()  # which claims its own size
     check_unpacked(stored, dataset.size * dataset.dtype.itemsize)
+    if dataset.ndim:
+        check_chunks(dataset, rows or slice(None))
     return dataset[rows]
 
 

@@ -17,6 +17,7 @@ from acwm_core.files import parse_json
 from acwm_formats.array_store import ArrayStore, StoredEpisode
 from acwm_formats.episode_bounds import INDEX
 from acwm_formats.frames import file_stamp
+from acwm_formats.hdf5_chunks import check_chunks
 from acwm_formats.hdf5_layouts import array, open_hdf5, values_of
 from acwm_formats.labels import Labels
 from acwm_formats.texts import LONGEST, Fact, text_facts
@@ -66,7 +67,9 @@ class HDF5Group(ArrayStore):
 
     def image(self, name: str, index: int) -> NDArray[Any] | bytes:
         """As in `ArrayStore`; rows of bytes are files of pictures."""
-        image = self.group[name][index]
+        stored = self.group[name]
+        check_chunks(stored, slice(index, index + 1))
+        image = stored[index]
         if isinstance(image, bytes):
             return image
         return image.tobytes() if image.ndim == 1 and image.dtype == np.uint8 else image

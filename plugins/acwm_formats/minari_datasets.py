@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched, parse_json
+from acwm_formats.arrow_files import check_arrow
 from acwm_formats.channels import Channels, named
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, Images, file_stamp, regular_times, stack_note
@@ -283,6 +284,8 @@ def _from_arrow(
     files = files_in(data / stored.episodes[index], [f".{stored.kind}"])
     for path in files:
         check_fetched(path)
+        if stored.kind == "arrow":
+            check_arrow(path)
     names = ["observations", "actions"]
     if stored.kind == "parquet":
         table = arrow.concat_tables([read_parquet(path, names) for path in files])

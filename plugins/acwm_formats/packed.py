@@ -12,6 +12,9 @@ from acwm_core.arrays import LARGE, RATIO, check_unpacked
 ZSTD, GZIP, BZIP2, XZ = b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\xfd7zXZ"
 ZLIB = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda")
 
+BLOSC = b"\x02"
+"""The version of its format; what a chunk unpacks to and its own length follow."""
+
 DEFLATED = 1032
 """How many times its size deflated data unpack to at most."""
 
@@ -28,8 +31,10 @@ def check_packed(data: bytes | memoryview) -> None:
     Raises:
         ValueError: they do.
     """
-    head = bytes(data[:6])
-    if head.startswith(ZSTD):
+    head = bytes(data[:16])
+    if head[:1] == BLOSC and int.from_bytes(head[12:], "little") == len(data):
+        check_unpacked(len(data), int.from_bytes(head[4:8], "little"))
+    elif head.startswith(ZSTD):
         check_unpacked(len(data), zstd_size(data))
     elif head.startswith((GZIP, *ZLIB)) and len(data) * DEFLATED > LARGE:
         _check_counted(data, zlib.decompressobj(47))

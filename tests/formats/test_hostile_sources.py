@@ -3,21 +3,26 @@
 import json
 import shutil
 import subprocess
+import zlib
 
 import gymnasium
 import h5py
 import numpy as np
 import pyarrow
 import pyarrow.dataset
+import pyarrow.ipc
 import pytest
 import zarr
 from click.testing import CliRunner
 from mcap.writer import CompressionType, Writer
 from minari.dataset.minari_storage import MinariStorage
+from numcodecs import Blosc, Zstd
 
 from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
+from acwm_formats.arrow_files import check_arrow
 from acwm_formats.format import detected_format
+from acwm_formats.hdf5 import HDF5
 from acwm_formats.minari_datasets import Minari
 from tests.formats import hostile, release
 from tests.formats.corpus import arrays, files, logs
@@ -308,6 +313,63 @@ def test_hdf5_that_claims_more_than_it_stores(tmp_path, claim):
         del file["observations/images/cam_high" if claim in ("frames", "pixels") else "action"]
         CLAIMS[claim](file)
     assert spoilt.name in refused(run("hdf5", path, tmp_path / "data", options))
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_chunks_of_hdf5_that_unpack_to_more_than_they_hold(tmp_path, monkeypatch, twice):
+    monkeypatch.setattr("acwm_formats.hdf5_chunks.LARGE", 2**22)  # so that a test need not be slow
+    rng = np.random.default_rng(0)
+    path = tmp_path / "mine.h5"
+    options = {"video": "front", "actions": "cmd", "rate": 10.0}
+    with h5py.File(path, "w") as file:
+        frames = rng.integers(0, 256, (8, 64, 64, 3), np.uint8)  # 12 KB, which do not shrink
+        stored = file.create_dataset(
+            "runs/0/front", data=frames, chunks=(1, 64, 64, 3), compression=1
+        )
+        file["runs/0/cmd"] = np.zeros((8, 2))
+        shown = HDF5().read(path, **options).splits[0].cameras["front"]
+        np.testing.assert_array_equal(np.stack([*shown.read(range(8))]), frames)
+        if twice:
+            del file["runs/0/front"]
+            plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            plist.set_chunk((1, 64, 64, 3))
+            for _ in range(2):
+                plist.set_deflate(9)
+            space, kind = h5py.h5s.create_simple((8, 64, 64, 3)), h5py.h5t.NATIVE_UINT8
+            h5py.h5d.create(file["runs/0"].id, b"front", kind, space, plist)
+        else:
+            stored.id.write_direct_chunk((3, 0, 0, 0), zlib.compress(bytes(5 * 2**20), 9))
+    said = refused(run("hdf5", path, tmp_path / "data", options))
+    assert (
+        "is compressed 2 times" if twice else "unpacks to more than the 12,288 it holds"
+    ) in said
+
+
+@pytest.mark.parametrize("codec", [Blosc("zstd"), Zstd(9)])
+def test_chunks_of_zarr_that_unpack_to_gigabytes(tmp_path, codec):
+    path, spoilt, options = source(tmp_path, "zarr")
+    about = json.loads((spoilt.parent / ".zarray").read_text())
+    about["compressor"] = codec.get_config()
+    (spoilt.parent / ".zarray").write_text(json.dumps(about))
+    bomb = codec.encode(bytes(2**28 + 2**20))
+    for chunk in spoilt.parent.glob("[0-9]*"):
+        chunk.write_bytes(bomb)
+    assert "claim to hold 269," in refused(run("zarr", path, tmp_path / "data", options))
+
+
+def test_buffers_of_arrow_that_unpack_to_gigabytes(tmp_path):
+    table = pyarrow.table({"x": np.zeros(2**12), "y": pyarrow.array(["a", "b"] * 2**11)})
+    path, lies = tmp_path / "x.arrow", 2**33
+    for codec in ("zstd", "lz4", None):
+        options = pyarrow.ipc.IpcWriteOptions(compression=codec)
+        with pyarrow.ipc.new_file(path, table.schema, options=options) as writer:
+            writer.write_table(table)
+        check_arrow(path)
+        if codec:
+            claim = (table["x"].nbytes).to_bytes(8, "little")
+            path.write_bytes(path.read_bytes().replace(claim, lies.to_bytes(8, "little")))
+            with pytest.raises(ValueError, match="claim to hold 8,589"):
+                check_arrow(path)
 
 
 @pytest.mark.parametrize(
