@@ -24,7 +24,10 @@ arrow: Any = importlib.import_module("pyarrow")  # it has no type annotations
 Table = Mapping[str, NDArray[Any]]
 """Columns ``[N]`` by name, all of the same length; a vector is a column ``NAME_i`` per entry."""
 
-SECONDS = {"_ns": 1e-9, "_us": 1e-6, "_ms": 1e-3, "_s": 1.0, "": 1.0}
+SECONDS = {
+    **{"_ns": 1e-9, "_nsec": 1e-9, "_us": 1e-6, "_µs": 1e-6, "_usec": 1e-6, "_ms": 1e-3},
+    **{"_msec": 1e-3, "_s": 1.0, "_sec": 1.0, "_secs": 1.0, "_seconds": 1.0, "": 1.0},
+}
 """Length of a unit of time in seconds, by the end of the column's name."""
 
 TIMES = ("time", "timestamp", "timestamps", "t", "seconds", "stamp")
@@ -132,7 +135,7 @@ def holds_numbers(column: NDArray[Any]) -> bool:
     """Whether a column holds numbers, at least some: one wrong word does not make it text."""
     values = column.tolist()
     return column.dtype.kind in "fiub" or any(
-        _is_number(value.replace(",", ".") if isinstance(value, str) else value) for value in values
+        _is_number(value.replace(",", "") if isinstance(value, str) else value) for value in values
     )
 
 
@@ -195,7 +198,7 @@ def seconds(table: Table, name: str, path: Path) -> NDArray[np.float64]:
     Raises:
         DataError: it is missing, or holds something else than finite numbers.
     """
-    unit = next(unit for ending, unit in SECONDS.items() if name.lower().endswith(ending))
+    unit = SECONDS[_named(name)[1]]
     values = number_column(table, name, path)
     whole = table[name].astype(np.int64) if table[name].dtype.kind in "iu" else None
     if whole is None or unit == 1.0:
@@ -205,10 +208,14 @@ def seconds(table: Table, name: str, path: Path) -> NDArray[np.float64]:
 
 
 def _bare(name: str) -> str:
-    lower = name.lower().strip()
-    for ending in ("_ns", "_us", "_ms", "_s"):
-        lower = lower.removesuffix(ending)
-    return lower
+    return _named(name)[0]
+
+
+def _named(name: str) -> tuple[str, str]:
+    """A name without the unit of time at its end, as in ``time_ms`` or ``Time [ms]``; and that."""
+    plain_name = re.sub(r"[\s_]*[\[(](\w+)[\])]$", r"_\1", name.lower().strip())
+    ending = next(ending for ending in SECONDS if plain_name.endswith(ending))
+    return plain_name.removesuffix(ending), ending
 
 
 def _split(name: str, values: Any) -> dict[str, NDArray[Any]]:
@@ -229,6 +236,7 @@ def _csv(path: Path) -> dict[str, Any]:
     head = re.split(rb"[\r\n]", data, maxsplit=1)[0]
     _check_width(head.count(delimiter) + 1)
     _check_head(head)
+    _check_delimiter(data, delimiter)
     commas = delimiter == b";" and _DECIMAL_COMMA.search(data) and not _DECIMAL_POINT.search(data)
     table = csv.read_csv(
         arrow.BufferReader(data),
@@ -276,6 +284,14 @@ def _without_comments(data: bytes) -> tuple[bytes, bytes]:
         lines.insert(0, header)
     kept = (line for line in lines if line[:1] != b"#" or line.count(delimiter) == count)
     return b"\n".join(kept), delimiter
+
+
+def _check_delimiter(data: bytes, delimiter: bytes) -> None:
+    """Refuse rows of several numbers without a delimiter that is known."""
+    lines = data.splitlines()[:2]
+    fields = re.split(rb"[\s|]+", lines[-1].strip()) if lines else []
+    if lines and delimiter not in lines[0] and len(fields) > 1 and all(map(_is_number, fields)):
+        raise ValueError("its numbers are separated by neither commas, semicolons nor tabs")
 
 
 def _check_head(head: bytes) -> None:

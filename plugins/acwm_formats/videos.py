@@ -139,7 +139,8 @@ class Videos(Format):
         root = Path(root)
         places = find_places(root, actions)
         if not places:
-            raise DataError(f"{root} holds no video and no folder of pictures")
+            loose = ": put those of each recording into a folder" * bool(_pictures(root))
+            raise DataError(f"{root} holds no video and no folder of pictures{loose}")
         if unlabelled:
             return _without_actions(root, places, rate, follow_links)
         table = _shared(root, places, actions)
@@ -263,7 +264,7 @@ class VideoFolder:
         paths = [path for path in _pictures(source) if _begins(path) == begins or not begins]
         if self.rate:
             times = regular_times(len(paths), exact(self.rate))
-        elif times is None or len(times) != len(paths):
+        elif times is None or len(times) != len(paths) or _counts_rows(times):
             raise DataError(f"{source} holds {len(paths)} pictures: give --rate, frames per second")
         stamps = [path.stat() for path in paths]
         stamp = f"{sum(s.st_size for s in stamps)} {max(s.st_mtime_ns for s in stamps)}"
@@ -272,11 +273,20 @@ class VideoFolder:
     def _same_clock(
         self, times: NDArray[np.float64] | None, frame_times: NDArray[np.float64], path: Path
     ) -> NDArray[np.float64] | None:
-        """The times of rows on the clock of the video."""
+        """The times of rows on the clock of the video; None if they count its frames."""
         if times is None or not len(frame_times):
             return times
+        if len(frame_times) - len(times) in (0, 1) and _counts_rows(times):
+            return None
         if self.from_first_row:
-            return times - times[0] + frame_times[0]
+            times = times - times[0] + frame_times[0]
+        span, shown = times[-1] - times[0], frame_times[-1] - frame_times[0]
+        if times[0] <= frame_times[-1] and span > 10 * shown > 0:
+            raise DataError(
+                f"the times of {path} span {span:,.4g} s, and the video {shown:.4g} s: in "
+                "milliseconds or nanoseconds, call their column time_ms or time_ns; if they number "
+                "frames, frame"
+            )
         if times[0] > frame_times[-1] or times[-1] < frame_times[0]:
             raise DataError(
                 f"the times of {path} ({times[0]:g} to {times[-1]:g} s) are not those of the video "
@@ -293,6 +303,11 @@ class VideoFolder:
         if times is None and self.columns.frame:
             frames = number_column(rows, self.columns.frame, path).astype(np.int64)
         return functools.partial(Samples, times=times, frames=frames)
+
+
+def _counts_rows(times: NDArray[np.float64]) -> bool:
+    """Whether what is called times numbers the rows, from 0 or 1."""
+    return len(times) > 2 and times[0] in (0, 1) and bool((np.diff(times) == 1).all())
 
 
 def find_places(root: Path, actions: str | None = None) -> list[VideoEpisode]:
@@ -510,7 +525,8 @@ def _notes(
     root: Path, places: Sequence[VideoEpisode], path: Path, chosen: Columns
 ) -> tuple[str, ...]:
     left = [name for name in read_table(path) if name not in {*chosen.actions, *chosen.states}]
-    left = [name for name in left if name not in (chosen.time, chosen.frame, chosen.episode)]
+    special = (chosen.time, chosen.frame, chosen.episode, *chosen.texts)
+    left = [name for name in left if name not in special]
     notes = [f"Actions are the columns {', '.join(chosen.actions)}."]
     if left:
         notes.append(f"Columns that are neither actions nor states: {', '.join(left)}.")

@@ -120,7 +120,7 @@ def test_columns_by_name(tmp_path):
     np.testing.assert_array_equal(recording.actions.values[:, 0], -np.arange(8))
     np.testing.assert_allclose(recording.actions.times, np.arange(8) / 10)
     np.testing.assert_array_equal(recording.states["seen"].values[:, 0], np.arange(8) % 2)
-    assert any("push, label" in note for note in found.notes)
+    assert any("neither actions nor states: push." in note for note in found.notes)
     assert found.actions.names == ("turn",)
     assert recording.rate == 10
 
@@ -199,3 +199,45 @@ def test_a_lone_table_is_told(tmp_path):
     write(tmp_path / "a.csv", CSV)
     write(tmp_path / "b.csv", CSV)
     assert "Tables without a video: b.csv." in Videos().read(tmp_path).notes
+
+
+def timed(folder, head, row):
+    """A film of 8 frames at 10 per second, and a table of times and of numbers from 0."""
+    film(folder / "a.mp4", 0)
+    write(folder / "a.csv", "\n".join([head, *map(row, range(8))]))
+    return Videos().read(folder).splits[0].actions
+
+
+@pytest.mark.parametrize(
+    ("head", "unit"),
+    [("Time [ms],x", 1e-3), ("timestamp (s),x", 1.0), ("t_sec,x", 1.0), ("TIME(us),x", 1e-6)],
+)
+def test_units_of_time_in_the_name_of_a_column(tmp_path, head, unit):
+    found = timed(tmp_path, head, lambda k: f"{k * 0.1 / unit:.6f},{k}")
+    assert found.values.tolist() == [[k] for k in range(8)]
+    np.testing.assert_allclose(found.times, np.arange(8) / 10)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_times_that_number_the_frames_are_no_seconds(tmp_path, first):
+    found = timed(tmp_path, "t,x", lambda k: f"{k + first},{k}")
+    assert found.times is None
+
+
+@pytest.mark.parametrize("head", ["time,x", "t,x"])
+def test_times_in_another_unit_are_refused(tmp_path, head):
+    with pytest.raises(
+        DataError, match=r"span 700 s, and the video 0\.7 s: in milliseconds or nano"
+    ):
+        timed(tmp_path, head, lambda k: f"{100 * k},{k}")
+
+
+@pytest.mark.parametrize("row", ["{k} -{k}.5", "{k}|{k}", "{k}   {k}"])
+def test_numbers_between_other_delimiters_are_refused(tmp_path, row):
+    with pytest.raises(DataError, match="separated by neither commas, semicolons nor tabs"):
+        timed(tmp_path, "x y", lambda k: row.format(k=k))
+
+
+def test_thousands_are_no_text(tmp_path):
+    with pytest.raises(DataError, match=r"'1,000\.5', which is not a number"):
+        timed(tmp_path, "x,y", lambda k: f'{k},"1,00{k}.5"')
