@@ -19,9 +19,10 @@ from acwm_core.files import check_fetched, parse_json
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, file_stamp, regular_times
 from acwm_formats.images import CHANNELS
-from acwm_formats.names import exact, text_note, word, words
+from acwm_formats.names import exact, word, words
 from acwm_formats.rlds_features import FEATURES, Feature, Lists, read_features
 from acwm_formats.sources import damage_of, guarded
+from acwm_formats.texts import text_fact, text_note
 from acwm_formats.tfrecords import RecordPlace, parse_example, read_record, record_places
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
 
@@ -310,8 +311,8 @@ def _facts(layout: Layout, lists: Lists, count: int) -> dict[str, Any]:
         if feature.path not in lists:
             continue
         if feature.kind == "text":
-            texts = list(dict.fromkeys(feature.texts(lists)))
-            facts[name] = texts[0] if len(texts) == 1 else texts
+            if (text := text_fact(feature.texts(lists))) is not None:
+                facts[name] = text
         elif feature.kind == "numbers" and int(np.prod(feature.shape)) <= 64:
             facts[name] = feature.values(lists, 1)[0].tolist()
     rewards = lists.get(REWARD)
