@@ -21,7 +21,8 @@ from acwm_core.env.task import Goal, Task
 from acwm_planning.policies.saved import PolicyInputs, layers_of
 from acwm_policy.episodes import Episodes
 from acwm_policy.learner import Learner
-from acwm_policy.lesson import Lesson, Measured
+from acwm_policy.lesson import Lesson, Measured, Place
+from acwm_policy.recordings import Recorded, Recordings
 from acwm_policy.scenes import Scenes, States
 
 SCENES, REPEAT, SPEED = 8, 2, 0.04
@@ -77,17 +78,16 @@ class LearnerChecks(Suite):
 
     kind = "learner"
 
-    def _lesson(self) -> Lesson:
+    def _lesson(self, place: Place | None = None) -> Lesson:
         shapes = {"position": [2]}
         inputs = PolicyInputs(shapes, shapes, [0.0] * 4, [0.12] * 4, [0.08] * 2)
         options = {"unit": 0.2, "bonus": 0.5, "watched": ["position"]}
-        episodes = Episodes(Glide(), ToTheGoal(), Disc.card, inputs, **options)
-        place = self._place
-        return Lesson(Disc.card, "goal", REPEAT, place, Measured(inputs, 0.2), episodes)
-
-    @functools.cached_property
-    def _place(self) -> Any:
-        return self.target.places[0]
+        source: Episodes | Recordings = Episodes(Glide(), ToTheGoal(), Disc.card, inputs, **options)
+        chosen: Place = place or self.target.places[0]
+        if chosen == "recordings":
+            hold, chunk = self.make().hold, self.make().chunk
+            source = Recordings(_recorded(8), _recorded(2), inputs, hold, chunk)
+        return Lesson(Disc.card, "goal", REPEAT, chosen, Measured(inputs, 0.2), source)
 
     def _begun(self, seed: int = 0) -> tuple[Learner, Lesson]:
         learner, lesson = self.make(), self._lesson()
@@ -147,7 +147,7 @@ class LearnerChecks(Suite):
         """After a few stages, end closer to the goals than standing still."""
         learner, _ = self._begun()
         learner.learn(8 * STAGE, lambda _: None)
-        network, episodes = learner.network(), self._lesson().episodes
+        network, episodes = learner.network(), self._lesson("dream").episodes
         vectors = episodes.begin(range(SCENES))
         start, ends = episodes.distances, np.full(SCENES, np.nan)
         with torch.no_grad():
@@ -158,6 +158,17 @@ class LearnerChecks(Suite):
                 vectors = step.vectors
         share = float(ends.mean() / start.mean())
         expect(share < 0.8, f"its policy ends at {share:.0%} of the distance of the start")
+
+
+def _recorded(number: int) -> list[Recorded]:
+    """Recordings of points that go straight to some place, and of what leads there."""
+    random, found = np.random.default_rng(number), list[Recorded]()
+    for _ in range(number):
+        begun, end = random.uniform(-0.2, 0.2, (2, 2))
+        actions = np.tile((end - begun) / (12 * SPEED), (13, 1))
+        states = torch.from_numpy(begun + SPEED * np.arange(13)[:, None] * actions)
+        found.append(Recorded(states, states, torch.from_numpy(actions)))
+    return found
 
 
 def _acted(network: nn.Sequential, spread: float) -> Tensor:

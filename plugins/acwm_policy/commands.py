@@ -34,8 +34,9 @@ def policy() -> None:
 @click.option(
     "--in",
     "place",
-    type=click.Choice(["dream", "simulator"]),
-    help="Where the policy acts while it learns: in the model (the default) or in the simulator.",
+    type=click.Choice(["dream", "simulator", "recordings"]),
+    help="What the policy learns from: acting in the model or in the simulator, or recordings; by "
+    "default the first that the algorithm can use.",
 )
 @click.option(
     "--steps",
@@ -55,7 +56,9 @@ def policy() -> None:
     help="Training episodes whose first frames and goals are used.",
 )
 @click.option(
-    "--data", type=DATASET, help="Dataset to take them from; by default the simulator draws them."
+    "--data",
+    type=DATASET,
+    help="Dataset to take them from (by default the simulator draws them), or to imitate.",
 )
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the training.")
 @click.option(
@@ -68,14 +71,12 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     MODEL is a run folder or a trained model; the trained model of the environment by default. It
     must predict states. OVERRIDES choose what learns (`acwm list learner`), and set its parameters
     by name: algorithm=sac learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
-    (fields of the state) and bonus=1 (reward for success). If it is interrupted, run the same
+    (fields of the state) and bonus=1 (reward for success). algorithm=clone imitates the recordings
+    of --data; without a task, ENVIRONMENT alone is enough. If it is interrupted, run the same
     command again to continue; with more --steps it trains on.
     """
     from acwm_policy.settings import settings_of
 
-    environment = task.rpartition(".")[0]
-    if not environment:
-        raise click.BadParameter(f"{task}: give ENVIRONMENT.TASK, such as reacher.reach")
     models = [word for word in words if "=" not in word]
     if len(models) > 1:
         raise click.BadParameter(f"give one model, not {', '.join(models)}")
@@ -84,13 +85,16 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     from acwm_policy.train import train_policy
 
     where = out or Path("runs/policies") / task
-    model = models[0] if models else environment
+    model = models[0] if models else task.partition(".")[0]
     trained = train_policy(
         model, task, settings=settings, out=where, place=place, progress=True, **options
     )
     facts = trained.card.training
     click.echo(f"{where}: {facts['steps']} steps in {facts['cpu_seconds']:.0f} s of processor time")
-    click.echo(f"next: acwm policy evaluate {where}")
+    if "error" in facts:
+        click.echo(f"held-out actions: {facts['error']:.2f} of the error of the mean action")
+    if trained.card.task:
+        click.echo(f"next: acwm policy evaluate {where}")
 
 
 @policy.command()
@@ -143,5 +147,7 @@ def print_evaluation(found: dict[str, Any]) -> None:
     headings = ("solved", "share, 95 %", "final distance", "p")
     print_table(Console(highlight=False, markup=False), title, headings, rows)
     gap = found["gap"]
+    if gap is None:
+        return
     about = "" if gap["low"] is None else f" [{gap['low']:+.0%}, {gap['high']:+.0%}]"
     click.echo(f"gap (dream − simulator): {gap['mean']:+.0%}{about}")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal, Task
@@ -153,17 +153,16 @@ class Episodes:
         self._scenes.detach()
         self._now, self._distance = self._now.detach(), self._distance.detach()
 
-    def score(self) -> tuple[float | None, float | None]:
+    def score(self, network: nn.Module) -> dict[str, float]:
         """Share of the last episodes that succeeded, and their mean return, if any has ended."""
         if not self.recent:
-            return None, None
+            return {}
         success, total = np.mean(self.recent, 0)
-        return float(success), float(total)
+        return {"success": float(success), "return": float(total)}
 
     def note(self) -> str:
         """How many of the last episodes succeeded."""
-        success, _ = self.score()
-        return "" if success is None else f"{success:.0%} solved"
+        return f"{np.mean(self.recent, 0)[0]:.0%} solved" if self.recent else ""
 
     def state(self) -> dict[str, Any]:
         """Plain values by which the starts that follow can be drawn again."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
@@ -132,10 +133,11 @@ def dream(policy: SavedPolicy, bundle: RunBundle, task: Task, start: DreamStart)
     """The facts of an episode of the policy in the model, as those of one in the simulator."""
     scenes = DreamScenes(bundle.world_model, [start], 1)
     episodes = Episodes(scenes, task, bundle.card, policy.card.inputs, unit=1.0, bonus=0.0)
-    vectors = episodes.begin([0])
+    vectors, decided = episodes.begin([0]), list[Tensor]()
     begun = float(episodes.distances[0])
     for _ in range(-(-task.max_steps // scenes.repeat)):
-        step = episodes.step(policy.scaled(vectors))
+        decided = decided or [*policy.scaled(vectors).unbind(1)]
+        step = episodes.step(decided.pop(0))
         vectors = step.vectors
         if step.over[0]:
             return {
@@ -193,7 +195,8 @@ def evaluate_policy(
     inner = make_environment(bundle.card.name, {"size": bundle.card.frame_size})
     with closing(inner):
         environment = TaskEnvironment(inner, task)
-        table = EvaluatedEpisodes(policy, bundle, environment, ROWS)
+        rows = [row for row in ROWS if row != DREAM or dreams(bundle, policy)]
+        table = EvaluatedEpisodes(policy, bundle, environment, rows)
         results = ResumableResults(where, identity, kind=EpisodeLine)
         with results.adding():
             label = f"evaluating at {task.name}" if progress else ""
@@ -216,9 +219,15 @@ def _summary(
         "tolerance": task.tolerance,
         **left.facts(),
         "rows": [asdict(row) for row in summarise(lines, ROWS)],
-        "gap": asdict(gap_of(lines)),
+        "gap": asdict(gap_of(lines)) if any(line["row"] == DREAM for line in lines) else None,
         "training": policy.card.training,
     }
+
+
+def dreams(bundle: RunBundle, policy: SavedPolicy) -> bool:
+    """Whether a model predicts what a policy observes, at the rate at which it decides."""
+    shapes, rate = bundle.world_model.state_shapes, bundle.world_model.codec.temporal_stride
+    return {*policy.card.inputs.state} <= {*shapes} and policy.card.repeat == rate
 
 
 def gap_of(lines: Sequence[Line]) -> PairedDifference:

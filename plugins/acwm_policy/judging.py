@@ -61,8 +61,8 @@ def needs_of(task: Task, states: States, goal: Goal) -> Needs:
             judged(task, method, observation_of(seen, frames), watched)
     except (NotPredicted, KeyError) as error:
         raise RecipeError(
-            f"the model predicts {', '.join(states)}, and the task {task.name!r} looks at more "
-            f"than that, so no policy can be trained in it ({str(error).strip(chr(39))})"
+            f"of the state, {', '.join(states)} are known, and the task {task.name!r} looks at "
+            f"more than that, so no policy can be trained for it ({str(error).strip(chr(39))})"
         ) from error
     return Needs([*seen.asked], [*aim.asked])
 

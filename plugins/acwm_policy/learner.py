@@ -26,11 +26,15 @@ class Learner(ABC):
         places: what it can learn from, the usual one first.
         usual_steps: number of steps by default.
         steps: number of steps so far.
+        hold: of recordings, number of frames for which an action of the policy is held.
+        chunk: of recordings, number of actions that it decides on at once.
     """
 
     places: ClassVar[tuple[Place, ...]] = ("dream", "simulator")
     usual_steps: ClassVar[int] = 200_000
     steps: int = 0
+    hold: int = 4
+    chunk: int = 1
 
     @classmethod
     def parameters(cls) -> Mapping[str, Parameter]:

@@ -27,6 +27,7 @@ from acwm_planning.episode import load_task
 from acwm_planning.policies.saved import PolicyInputs, side_by_side
 from acwm_policy.episodes import Episodes
 from acwm_policy.judging import judge, needs_of
+from acwm_policy.recordings import Recordings, read_recordings
 from acwm_policy.scenes import DreamScenes, Scenes, SimulatorScenes, States
 
 Place = Literal["dream", "simulator", "recordings"]
@@ -66,11 +67,18 @@ class Lesson:
     repeat: int
     place: Place
     measured: Measured
-    source: Episodes
+    source: Episodes | Recordings
 
     @property
     def episodes(self) -> Episodes:
-        """Episodes to act in, side by side."""
+        """Episodes to act in, side by side; there are none if `place` is "recordings"."""
+        assert isinstance(self.source, Episodes)
+        return self.source
+
+    @property
+    def recordings(self) -> Recordings:
+        """Recordings to imitate, if `place` is "recordings"."""
+        assert isinstance(self.source, Recordings)
         return self.source
 
 
@@ -89,7 +97,7 @@ def find_task(name: str, card: EnvironmentCard) -> Task:
     """
     environment, _, task = name.rpartition(".")
     if environment and environment != card.name:
-        raise RecipeError(f"{name} is a task of {environment}, but the model is of {card.name}")
+        raise RecipeError(f"{name} is a task of {environment}, not of {card.name}")
     return load_task(card.name, task)
 
 
@@ -199,6 +207,35 @@ def prepare(
     options = {"unit": unit, "bonus": bonus, "watched": needs.state, "seed": seed}
     episodes = Episodes(scenes, task, card, inputs, **options)
     return Lesson(card, task.name, scenes.repeat, place, measured, episodes)
+
+
+def imitate(
+    folder: str | Path,
+    name: str,
+    observe: Sequence[str] | None,
+    hold: int,
+    chunk: int,
+) -> Lesson:
+    """Recordings to imitate.
+
+    Args:
+        folder: a dataset.
+        name: ``ENVIRONMENT.TASK``, or ``ENVIRONMENT`` for a policy without goals.
+        observe: names of the fields of the state to observe; see `PolicySettings`.
+        hold: number of frames for which an action is held.
+        chunk: number of actions that are decided on at once.
+
+    Raises:
+        RecipeError: the dataset is of another environment.
+        DataError: it has no states, or too few episodes.
+    """
+    train = EpisodeDataset(Path(folder), "train")
+    card = train.card.environment
+    task = None if name == card.name else find_task(name, card)
+    tested = EpisodeDataset(Path(folder), "ind_test") if train.card.splits.get("ind_test") else None
+    recordings, inputs = read_recordings(train, tested, task, observe, hold, chunk)
+    named = "" if task is None else task.name
+    return Lesson(card, named, hold, "recordings", Measured(inputs, 1.0), recordings)
 
 
 def chosen_fields(

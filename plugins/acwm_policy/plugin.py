@@ -34,6 +34,11 @@ def register_learners(registry: Registry) -> None:
         "acwm_policy.backprop:Backprop",
         summary="gradients through the dream: short-horizon actor-critic (Xu et al. 2022)",
     )
+    registry.add(
+        "clone",
+        "acwm_policy.clone:Clone",
+        summary="does what was done in recordings (behaviour cloning)",
+    )
 
 
 @hookimpl

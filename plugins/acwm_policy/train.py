@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import torch
 
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.evaluate import choose_device
@@ -25,7 +26,7 @@ from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.threads import use_threads
 from acwm_planning.policies.saved import PolicyCard, PolicyInputs, SavedPolicy, layers_of
 from acwm_policy.learner import Learner
-from acwm_policy.lesson import Lesson, Measured, Place, beginnings, find_task, prepare
+from acwm_policy.lesson import Lesson, Measured, Place, beginnings, find_task, imitate, prepare
 from acwm_policy.settings import PolicySettings, learner_class
 
 SETTINGS_FILE, CHECKPOINT, CURVE = "settings.json", "checkpoint.pt", "curve.csv"
@@ -40,12 +41,13 @@ VERSION = 1
 PLACES: Mapping[Place, str] = {
     "dream": "in the dream",
     "simulator": "in the simulator",
+    "recordings": "from recordings",
 }
 """Phrases for where a policy learns."""
 
-COLUMNS = ("steps", "success", "return", "cpu_seconds")
-"""Columns of the curve: steps of all scenes together, success and return of the last episodes where
-the policy is trained, and the seconds of processor time that training has taken."""
+COLUMNS = ("steps", "success", "return", "error", "cpu_seconds")
+"""Columns of the curve: steps, success and return of the last episodes where the policy is trained,
+or its error on held-out recordings, and the seconds of processor time that training has taken."""
 
 
 def train_policy(
@@ -76,7 +78,7 @@ def train_policy(
             default the learner's.
         scenes: number of scenes side by side; by default 64 in the dream and 1 in the simulator.
         starts: number of training episodes whose starts are used.
-        data: dataset to take the starts from instead of the simulator.
+        data: dataset to take the starts from instead of the simulator, or to imitate.
         seed: of the starts, the network and the exploration.
         device: device of the model.
         progress: show a progress bar.
@@ -91,6 +93,10 @@ def train_policy(
         known = " or ".join(PLACES[each] for each in kind.places)
         raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
     steps = kind.usual_steps if steps is None else steps
+    if place == "recordings":
+        return _imitate(task, settings, out, steps, data, seed, progress)
+    if "." not in task:
+        raise RecipeError(f"{task}: give ENVIRONMENT.TASK, such as reacher.reach")
     number = scenes or (64 if place == "dream" else 1)
     bundle, weights = load_run(run), RunFolder(find_run(run)).weights
     goal_task = find_task(task, bundle.card)
@@ -120,6 +126,34 @@ def train_policy(
         )
         with closing(lesson.source):
             return _learn(lesson, settings, about, out, steps, stored, progress)
+
+
+def _imitate(
+    name: str,
+    settings: PolicySettings,
+    out: Path,
+    steps: int,
+    data: Path | None,
+    seed: int,
+    progress: bool,
+) -> SavedPolicy:
+    if data is None:
+        raise RecipeError(f"{settings.algorithm} imitates recordings: name a dataset with --data")
+    learner = settings.learner()
+    about = {
+        "environment": name.partition(".")[0],
+        "task": name.partition(".")[2],
+        "place": "recordings",
+        "data": str(data),
+        "identity": EpisodeDataset(data, "train").checksum,
+        "seed": seed,
+        **asdict(settings),
+    }
+    with _opened(out, about):
+        use_threads(None, None, choose=True)
+        lesson = imitate(data, name, settings.observe, learner.hold, learner.chunk)
+        stored = load_checkpoint(out / CHECKPOINT)
+        return _learn(lesson, settings, about, out, steps, stored, progress)
 
 
 def _opened(out: Path, about: Mapping[str, Any]) -> Any:
@@ -199,8 +233,9 @@ class _Keeper:
         """Write everything; a killed command goes on from here."""
         now = time.process_time()
         self._seconds, self._began = self._seconds + now - self._began, now
-        score = self._lesson.source.score()
-        self._rows.append([self._learner.steps, *score, round(self._seconds, 1)])
+        score = self._lesson.source.score(self._learner.network())
+        values = [score.get(name) for name in COLUMNS[1:-1]]
+        self._rows.append([self._learner.steps, *values, round(self._seconds, 1)])
         self._policy().save(self._out)
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self._rows])
@@ -222,7 +257,12 @@ class _Keeper:
     def _policy(self) -> SavedPolicy:
         lesson, card = self._lesson, self._lesson.card
         network = copy.deepcopy(self._learner.network())
-        facts = {"steps": self._learner.steps, "cpu_seconds": round(self._seconds, 1)}
+        facts: dict[str, Any] = {
+            "steps": self._learner.steps,
+            "cpu_seconds": round(self._seconds, 1),
+        }
+        layers = layers_of(network)
+        network_size = next(size for size in reversed(layers) if isinstance(size, int))
         about = PolicyCard(
             environment=card.name,
             task=lesson.task,
@@ -230,8 +270,9 @@ class _Keeper:
             low=[*map(float, card.action.low)],
             high=[*map(float, card.action.high)],
             inputs=lesson.measured.inputs,
-            layers=layers_of(network),
-            training={**self._about, **facts},
+            layers=layers,
+            training={**self._about, **facts, **lesson.source.score(network)},
+            chunk=network_size // card.action.size,
         )
         return SavedPolicy(about, network)
 

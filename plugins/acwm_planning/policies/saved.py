@@ -94,6 +94,7 @@ class PolicyCard:
         inputs: what it observes.
         layers: the network: numbers of linear layers among names of `ACTIVATIONS`.
         training: how it was trained, for people.
+        chunk: number of actions that it decides on at once.
     """
 
     environment: str
@@ -104,6 +105,7 @@ class PolicyCard:
     inputs: PolicyInputs
     layers: list[int | str]
     training: dict[str, Any]
+    chunk: int = 1
 
 
 class SavedPolicy:
@@ -119,17 +121,21 @@ class SavedPolicy:
     def __init__(self, card: PolicyCard, network: nn.Module) -> None:
         self.card, self._network = card, network.eval()
         self._before: Tensor | None = None
+        self._decided = list[Tensor]()
         self._goal: Tensor | None = None
 
     @torch.no_grad()
     def scaled(self, vectors: Tensor) -> Tensor:
-        """Actions scaled to [-1, 1], `[N, A]`, for vectors of observations `[N, O]`."""
-        return self._network(vectors)
+        """The next actions, scaled to [-1, 1], `[N, chunk, A]`, for observations `[N, O]`."""
+        return self._network(vectors).unflatten(1, (self.card.chunk, -1))
 
     def reset(self, goal: Goal) -> None:
         """Start an episode."""
-        fields = {name: np.asarray(goal.state[name])[None] for name in self.card.inputs.goal}
-        self._goal, self._before = side_by_side(fields, self.card.inputs.goal), None
+        shapes = self.card.inputs.goal
+        fields = {name: np.asarray(goal.state[name])[None] for name in shapes}
+        nothing = torch.zeros(1, 0, dtype=torch.float64)
+        self._goal = side_by_side(fields, shapes) if shapes else nothing
+        self._before, self._decided = None, []
 
     def predict(self, state: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """The next raw action `[A]`; what is unknown is taken to be as it was.
@@ -148,8 +154,10 @@ class SavedPolicy:
         now = side_by_side({name: np.asarray(state[name])[None] for name in shapes}, shapes)
         before = now if self._before is None else self._before
         self._before = now = torch.where(now.isfinite(), now, before)
-        scaled = self.scaled(self.card.inputs.vectors(now, before, self._goal))
-        return raw_actions(scaled, self.card.low, self.card.high)[0].numpy()
+        if not self._decided:
+            vectors = self.card.inputs.vectors(now, before, self._goal)
+            self._decided = [*self.scaled(vectors)[0]]
+        return raw_actions(self._decided.pop(0), self.card.low, self.card.high).numpy()
 
     def save(self, folder: Path) -> None:
         """Write the policy's file into a folder."""
@@ -228,9 +236,12 @@ def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
     sizes = len(inputs.mean), len(inputs.std), len(inputs.change)
     linear = [each for each in network if isinstance(each, nn.Linear)]
     ends = (linear[0].in_features, linear[-1].out_features) if linear else (0, 0)
-    if sizes != (state + goal, state + goal, state) or ends != (inputs.size, len(card.low)):
+    if sizes != (state + goal, state + goal, state) or ends != (
+        inputs.size,
+        card.chunk * len(card.low),
+    ):
         raise ValueError("its sizes do not fit each other")
-    if len(card.low) != len(card.high) or card.repeat < 1:
+    if len(card.low) != len(card.high) or min(card.repeat, card.chunk) < 1:
         raise ValueError("its actions have no bounds")
 
 
@@ -251,7 +262,7 @@ def policy_for(name: str, card: EnvironmentCard, task: str | None = None) -> Sav
         RecipeError: it was trained for another environment or task.
     """
     policy = SavedPolicy.read(Path(name))
-    wanted = card.name, policy.card.task if task is None else task
+    wanted = card.name, task if task and policy.card.task else policy.card.task
     if (policy.card.environment, policy.card.task) != wanted:
         raise RecipeError(
             f"the policy {name} was trained for {policy.card.environment}.{policy.card.task}, not "
