@@ -19,7 +19,10 @@ _WHOSE = (
     *("trial", "take"),
 )
 
-_ALSO = ("seq", "sequence", "path", "run", "clip", "game", "segment", "session", "recording")
+_ALSO = (
+    *("seq", "sequence", "path", "run", "clip", "game", "segment", "session", "recording"),
+    *("scene", "video", "file"),
+)
 
 
 def _names(*parts: str) -> frozenset[str]:
@@ -33,18 +36,28 @@ ENDS = _names("end", "ends", "stop", "stops", "to")
 EDGES = _names("bounds", "boundaries", "range", "ranges", "slices", "limits")
 COUNTERS = frozenset(
     {"step", "step_idx", "step_index", "timestep", "timesteps", "time_step", "time_steps"}
-    | {"frame", "frame_idx", "frame_index", "frame_id"}
+    | {"frame", "frame_idx", "frame_index", "frame_id", "frame_number", "step_id", "step_no"}
+    | {"episode_step", "ep_step"}
 )
+CLOCKS = frozenset({"t", "time", "times", "timestamp", "timestamps", "seconds"})
+"""Times of the rows, which begin anew with an episode; they may be a state as well."""
 NUMBERS = _names("idx", "idxs", "index", "indices", "id", "ids", "num", "number", "no") | {
     *_WHOSE,
-    "trajectories",
+    *("trajectories", "sequence", "seq", "uuid", "file", "filename"),
 }
 LAST = frozenset(
     f"{name}{plural}"
     for name in ("terminal", "timeout", "done", "termination", "truncation", "is_last")
     for plural in ("", "s")
 ) | {"terminated", "truncated", "is_terminal", "last"}
-FIRST = frozenset({"is_first", "first"})
+FIRST = frozenset({"is_first", "first", "reset", "resets", "is_reset"})
+STEP_TYPE = "step_type"
+"""0 in the first row of an episode, as `dm_env` has it."""
+
+GOING_ON = frozenset(
+    {"discount", "discounts", "continue", "continues", "not_done", "not_dones", "mask", "masks"}
+)
+"""Flags that are 0 in the last row of an episode."""
 INDEX = ("episode_data_index", "episodes", "episode", "meta")
 """Groups that say where episodes are, in which a name such as ``from`` is that of an episode."""
 
@@ -61,7 +74,15 @@ def divides(name: str) -> bool:
 
 def tells(name: str) -> bool:
     """Whether an array of this name may tell episodes apart, in whatever way."""
-    return divides(name) or plain(name) in NUMBERS | LAST | FIRST | COUNTERS
+    return divides(name) or plain(name) in NUMBERS | LAST | FIRST | COUNTERS | GOING_ON | {
+        STEP_TYPE
+    }
+
+
+def may_tell(name: str, values: Any, count: int) -> bool:
+    """Whether an array may tell episodes of `count` rows apart, by its name or by its content."""
+    is_short = values.ndim == 1 and 2 <= len(values) < count and values.dtype.kind in "iu"
+    return tells(name) or plain(name) in CLOCKS or is_short
 
 
 def bounds_of(
@@ -86,7 +107,7 @@ def bounds_of(
     whole = {name: v for name, v in known.items() if v.dtype.kind in "iuf" and len(v)}
     edges = _edges(whole, count) or _runs(known, count, where)
     if edges is None and flags:
-        edges = _flagged(known, count) or _counted(whole, count)
+        edges = _flagged(known, count) or _counted(whole, count) or _fitting(whole, count)
     if edges is None:
         return None
     ordered = sorted(edges)
@@ -145,7 +166,9 @@ def _flagged(known: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
     """Told by flags of last or first rows."""
     flags = {n: v.astype(float) != 0 for n, v in known.items() if v.dtype.kind in "biuf"}
     last = [v for name, v in flags.items() if name in LAST and len(v) == count]
+    last += [~v for name, v in flags.items() if name in GOING_ON and len(v) == count]
     first = [v for name, v in flags.items() if name in FIRST and len(v) == count]
+    first += [~v for name, v in flags.items() if name == STEP_TYPE and len(v) == count]
     if first:
         starts = np.flatnonzero(first[0])
         return list(itertools.pairwise([0, *starts[starts > 0].tolist(), count]))
@@ -157,11 +180,27 @@ def _flagged(known: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
 
 
 def _counted(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
-    """Told by a number of the row in its episode, which counts up by one and begins anew."""
+    """Told by a number of the row in its episode, or by its time there, which begin anew."""
     for name, values in whole.items():
-        if name in COUNTERS and len(values) == count > 1:
-            steps = np.diff(values)
-            starts = np.flatnonzero(steps != 1) + 1
-            if (values[starts] == values[0]).all():
+        if name in COUNTERS | CLOCKS and len(values) == count > 1:
+            steps = np.diff(values.astype(np.float64))
+            usual = 1.0 if name in COUNTERS else float(np.median(steps))
+            starts = np.flatnonzero(steps != 1 if name in COUNTERS else steps <= 0) + 1
+            if usual > 0 and (np.abs(values[starts] - values[0]) < usual / 2).all():
                 return list(itertools.pairwise([0, *starts.tolist(), count]))
+    return None
+
+
+def _fitting(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
+    """Told by whole numbers, fewer than the rows, that are lengths of episodes or where they end.
+
+    Their name is not known, but they add up to the number of rows, or grow to it.
+    """
+    for values in (v.astype(np.int64) for v in whole.values() if v.dtype.kind in "iu"):
+        if not 2 <= len(values) < count or values.min() < 0:
+            continue
+        edges = np.cumsum(values) if values.sum() == count else values
+        edges = edges[1:] if edges[0] == 0 else edges
+        if edges[-1] == count and len(edges) > 1 and (np.diff(edges) > 0).all():
+            return list(itertools.pairwise([0, *edges.tolist()]))
     return None

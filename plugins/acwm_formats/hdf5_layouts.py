@@ -18,7 +18,7 @@ from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout
-from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, tells
+from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, may_tell, tells
 from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.hdf5_chunks import check_chunks
 from acwm_formats.hdf5_links import check_references, external_links, open_plain
@@ -238,7 +238,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
                 for name, item in part.items()
                 if isinstance(item, h5py.Dataset)
                 and item.ndim in (1, 2)
-                and tells(_qualified(prefix, name))
+                and may_tell(_qualified(prefix, name), item, count)
             }
             where = f"{group.file.filename} ({', '.join(arrays)})"
             if arrays and (bounds := bounds_of(arrays, count, where, flags=alone)):

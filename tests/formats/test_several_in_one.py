@@ -39,6 +39,12 @@ SAYS = {
     "pairs": {"episode_bounds": np.stack([STARTS, ENDS], 1)},
     "limits": {"episode_boundaries": np.append(0, ENDS)},
     "counters": {"step_idx": np.arange(COUNT) - STARTS[NUMBERS]},
+    "lengths of another name": {"n_steps": LENGTHS},
+    "ends of another name": {"cumulative": ENDS},
+    "flags of what goes on": {"discount": 1.0 - LAST},
+    "resets": {"reset": FIRST},
+    "kinds of steps": {"step_type": np.where(FIRST, 0, 1 + LAST)},
+    "a scene": {"scene_id": NUMBERS},
 }
 
 
@@ -234,3 +240,23 @@ def test_one_video_of_several_episodes_is_refused(tmp_path, column):
     (tmp_path / "a.csv").write_text(f"{column},x\n0,1\n0,2\n0,3\n1,4\n1,5\n1,6\n")
     with pytest.raises(DataError, match=f"column {column} .* numbers 2 episodes"):
         Videos().read(tmp_path).splits[0]
+
+
+def test_times_that_begin_anew_tell_episodes_apart(tmp_path):
+    times = 5.0 + 0.1 * (np.arange(COUNT) - STARTS[NUMBERS])
+    path = file_of(tmp_path / "all.h5", {"timestamp": times})
+    assert are_the_four(HDF5().read(path, video="pixels", actions="action", rate=10).splits)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"keyframes": [0, 10, 25]},
+        {"limits": [1, 2, 3]},
+        {"stage": NUMBERS},
+        {"t": np.arange(COUNT)},
+    ],
+)
+def test_other_numbers_tell_no_episodes(other):
+    arrays = {name: np.asarray(values) for name, values in other.items()}
+    assert bounds_of(arrays, COUNT, "it") is None

@@ -118,7 +118,8 @@ def test_texts_are_named_and_hidden_arrays_are_not_read(tmp_path):
     group.create_array("data/task", data=np.array(["push"] * 27))
     (path / "data/state").rename(path / "data/.state")  # whose links nobody looked at
     recorded = ZarrReplay().read(path, **options)
-    assert recorded.notes == ("Arrays that were left out: task.",)
+    kept = "Texts were kept as facts of the episodes: task. No model reads them."
+    assert recorded.notes == (kept,)
     assert recorded.splits[0].states == {}
 
 
