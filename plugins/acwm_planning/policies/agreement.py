@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from acwm_core.evaluation.statistics import (
     CONFIDENCE,
@@ -41,21 +39,28 @@ def mmrv(judge: Scores, truth: Scores) -> float:
     return float(np.where(better != truly, gap, 0.0).max(1).mean())
 
 
-def _correlation(name: str) -> Statistic:
+def _pairs(scores: Scores) -> Scores:
+    """Which of two is better, `[P, P]`: 1, 0 or −1."""
+    return np.sign(scores[:, None] - scores[None])
+
+
+def _correlation(of: Callable[[Scores], Scores]) -> Statistic:
+    """Pearson's correlation of something of the scores."""
+
     def statistic(judge: Scores, truth: Scores) -> float:
         if len(judge) < 2 or np.ptp(judge) == 0 or np.ptp(truth) == 0:
             return math.nan
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", stats.NearConstantInputWarning)
-            return float(getattr(stats, name)(judge, truth).statistic)
+        one, other = (values - values.mean() for values in (of(judge), of(truth)))
+        spread = math.sqrt((one @ one) * (other @ other))
+        return float(np.clip(one @ other / spread, -1, 1)) if spread else math.nan
 
     return statistic
 
 
 STATISTICS: Mapping[str, Statistic] = {
-    "pearson": _correlation("pearsonr"),
-    "spearman": _correlation("spearmanr"),
-    "kendall": _correlation("kendalltau"),  # τ-b, which accounts for ties
+    "pearson": _correlation(lambda scores: scores),
+    "spearman": _correlation(lambda scores: _pairs(scores).sum(1)),  # twice the rank, shifted
+    "kendall": _correlation(lambda scores: _pairs(scores).ravel()),  # τ-b, which accounts for ties
     "mmrv": mmrv,
     "optimism": lambda judge, truth: float((judge - truth).mean()),
 }
