@@ -24,17 +24,13 @@ from tests.episodes import assert_same
 CHECKS = checks_of(EnvironmentChecks)
 
 
-QUICK = ("reacher",)
-"""Worlds that `make test` checks; `.ci/run` checks all, and only their variants are slow."""
-
-
 def worlds():
     """Parameters for a test: the installed environments, one for each module of a simulator."""
     modules = {part.name: part.target.partition(":")[0] for part in installed("environment")}
     first = {module: name for name, module in reversed(modules.items())}.values()
     for part in installed("environment"):
         marks = pytest.mark.ci if part.name in first else pytest.mark.slow
-        yield pytest.param(part, id=part.name, marks=[] if part.name in QUICK else marks)
+        yield pytest.param(part, id=part.name, marks=marks)
 
 
 def with_two_threads(make):

@@ -12,6 +12,8 @@ from acwm_experiment.table import Experiment
 from tests.experiment.parts import EXPERIMENT, HEARD, HOLD, write_experiment
 from tests.folders import wait_until
 
+pytestmark = pytest.mark.ci
+
 STEPS = 6  # one dataset, two trainings and evaluations, a report
 RUNS = ("tiny-0", "tiny-width6-0")
 
@@ -59,7 +61,6 @@ def test_what_is_done_is_not_done_again(whole, acwm):
     assert results(folder) == before
 
 
-@pytest.mark.ci
 def test_killed_anywhere_it_comes_to_the_same_results(whole, acwm, tmp_path):
     """While it simulates, trains and evaluates; the last time two at once."""
     write_experiment(tmp_path)
@@ -107,7 +108,6 @@ def test_ctrl_c_lets_a_training_save(acwm, whole, tmp_path):
     assert not list((made / "logs").glob("*.state"))
 
 
-@pytest.mark.ci
 def test_a_failed_run_is_told_and_tried_again(acwm, whole, tmp_path):
     """That it stops no other is what test_local proves; here the other one is done."""
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)

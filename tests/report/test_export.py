@@ -46,6 +46,7 @@ def summary_of(run):
     return json.loads((run / "evaluation/summary.json").read_text())
 
 
+@pytest.mark.ci
 def test_csv_holds_the_numbers_of_the_summary_at_full_precision(exported):
     run, out = exported
     rows = summary_of(run)["splits"]["ood_test"]["scores"]["rows"]
@@ -63,6 +64,7 @@ def test_csv_holds_the_numbers_of_the_summary_at_full_precision(exported):
     assert worst == pytest.approx(20)
 
 
+@pytest.mark.ci
 def test_markdown_parses_back_to_the_written_numbers(exported):
     run, out = exported
     text = (out / "tables/scores-ind_test.md").read_text(encoding="utf-8")
@@ -79,6 +81,7 @@ def test_markdown_parses_back_to_the_written_numbers(exported):
     )
 
 
+@pytest.mark.ci
 def test_latex_is_balanced_and_has_as_many_columns_as_it_says(exported):
     _, out = exported
     files = list((out / "tables").glob("*.tex"))
@@ -100,6 +103,7 @@ def check_latex(text):
 
 
 @pytest.mark.skipif(not shutil.which("pdflatex"), reason="there is no pdflatex")
+@pytest.mark.ci
 def test_latex_compiles(exported, tmp_path):
     _, out = exported
     tables = [path.read_text(encoding="utf-8") for path in (out / "tables").glob("*.tex")]

@@ -27,6 +27,11 @@ def names(requirements):
     return {canonicalize_name(Requirement(line).name) for line in requirements}
 
 
+def name_of(function):
+    """The last part of the name of what is called."""
+    return getattr(function, "attr", getattr(function, "id", ""))
+
+
 def imported_modules(*folders):
     """Top-level modules of others that the sources import, lazily or not."""
     modules = set()
@@ -36,7 +41,7 @@ def imported_modules(*folders):
                 modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 modules.add(node.module)
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            elif isinstance(node, ast.Call) and name_of(node.func).endswith("import_module"):
                 modules |= {a.value for a in node.args if isinstance(a, ast.Constant)}
     tops = {str(module).partition(".")[0] for module in modules} - sys.stdlib_module_names
     return {top for top in tops if not top.startswith("acwm_")}

@@ -122,9 +122,10 @@ def part(rows, parts, number):
         ("fsdp", 64, False, (0, 41), 64),
         ("hsdp", 8, False, (3,), 8),
         ("hsdp", 64, False, (0, 41), 8),
-        ("ddp", 8, True, (5,), 1),
-        ("fsdp", 64, True, (41,), 64),
-        ("hsdp", 64, True, (41,), 8),
+        *(
+            pytest.param(*compiled, marks=pytest.mark.ci)
+            for compiled in (("ddp", 8, True, (5,), 1), ("hsdp", 64, True, (41,), 8))
+        ),
     ],
 )
 def test_every_process_takes_its_part(strategy, world, compiled, ranks, parts, data, tmp_path):

@@ -152,7 +152,10 @@ def leveldb_records(data):
 SERVICES = {"tensorboard": tensorboard, "mlflow": mlflow, "wandb": wandb}
 
 
-@pytest.mark.parametrize("name", [*SERVICES, "csv"])
+@pytest.mark.parametrize(
+    "name",
+    ["csv", "tensorboard", *(pytest.param(n, marks=pytest.mark.ci) for n in ("mlflow", "wandb"))],
+)
 def test_a_run_is_trained_continued_judged_and_shipped_with_each(
     name, drifting, tmp_path, offline, monkeypatch
 ):

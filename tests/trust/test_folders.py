@@ -100,7 +100,7 @@ def test_a_name_in_a_card_decides_no_folder(data, tmp_path, name):
 DEEP = "\n".join(" " * n + "a:" for n in range(2000))
 
 
-@pytest.mark.parametrize("text", ["&a [*a]", "[" * 5000, DEEP])
+@pytest.mark.parametrize("text", ["&a [*a]", "[" * 2000, DEEP])
 def test_cards_and_recipes_that_never_end_are_refused(data, tmp_path, text):
     (data / "card.yaml").write_text(text)
     assert "is not a dataset card" in one_sentence("data", "info", data)
