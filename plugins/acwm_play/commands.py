@@ -57,9 +57,8 @@ def play(runs: tuple[Path, ...], **options: Any) -> None:
         raise RecipeError("--export writes the page of one run: name one")
     worlds = playable(runs, **options)
     if recorded := dict.fromkeys(world.environment for world in worlds if world.data):
-        names = f"{', '.join(recorded)} {'are' if len(recorded) > 1 else 'is'} recorded"
         gone = "the simulator, factors, tasks, errors of states and recording"
-        click.echo(f"not available, because {names}: {gone}")
+        click.echo(f"not available for recorded data ({', '.join(recorded)}): {gone}")
     if folder and worlds[0].data:
         raise RecipeError(f"--export needs a simulator, but {worlds[0].environment} is recorded")
     if folder:

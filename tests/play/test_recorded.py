@@ -134,7 +134,7 @@ def test_one_line_says_what_is_left_out(run, monkeypatch):
     done = CliRunner().invoke(main, ["play", str(run)])
     assert done.exit_code == 0, done.output
     (line,) = done.output.splitlines()
-    assert "not available, because mine is recorded: the simulator" in line
+    assert "not available for recorded data (mine): the simulator" in line
 
 
 def test_without_simulator_and_data_nothing_is_played(run, tmp_path):
