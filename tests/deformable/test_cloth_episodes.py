@@ -9,6 +9,8 @@ from acwm_deformable.cloth_move import MAX_STEP, ClothMove8D
 from tests.deformable.cloth_play import CLOTH, SPHERE, Unseen, Unseen8D
 from tests.sim.playing import play, states
 
+pytestmark = pytest.mark.ci
+
 
 class Watch:
     """Collects what physics forbids, and how often what is wanted happens."""
@@ -41,7 +43,6 @@ def parted():
 
 
 @pytest.mark.parametrize("variant", ["shared", "parted"])
-@pytest.mark.ci
 def test_edges_stay_within_five_percent_under_push_and_pull(variant, request):
     """But for single edges of cloth that two free arms wedge between themselves and the sphere."""
     strains = np.array(request.getfixturevalue(variant)[1].strains)
