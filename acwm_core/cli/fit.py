@@ -92,8 +92,8 @@ def _advised(plain: Recipe, name: str, overrides: Sequence[str]) -> Recipe:
     suited, advice = advised(name, overrides)
     if advice is None:
         return plain
-    taken = f"{name} +{advice.overlay}" if advice.overlay else name
-    click.echo(f"{taken}, because {advice.why}; for another model, name an overlay")
+    taken = f"{name} +{advice.overlay}" if advice.overlay else f"{name} as it is"
+    click.echo(f"{taken}, because {advice.why}; name an overlay for another model")
     return compose(name, suited) if advice.overlay else plain
 
 

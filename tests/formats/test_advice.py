@@ -99,7 +99,7 @@ def test_fit_small_takes_it_and_says_why(data, monkeypatch, capsys):
     assert said.startswith("small +points, because the camera stands still")
     assert said.count("\n") == 1
     texts = [each.text for each in survey(data).findings]
-    assert any(text.startswith("acwm fit small takes small +points") for text in texts)
+    assert any(text.startswith("acwm fit small takes +points") for text in texts)
 
 
 def test_what_is_named_is_taken(data, monkeypatch):

@@ -261,8 +261,8 @@ def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
 
 def _of_model(survey: Survey) -> Iterator[Finding]:
     advice = advice_on(survey.card, survey.movement)
-    overlay = f" +{advice.overlay}" if advice.overlay else ""
-    yield Finding("good", f"acwm fit small takes small{overlay}: {advice.why}")
+    model = f"+{advice.overlay}" if advice.overlay else "its recurrent model"
+    yield Finding("good", f"acwm fit small takes {model}: {advice.why}")
 
 
 def _of_duplicates(survey: Survey) -> Iterator[Finding]:
