@@ -166,14 +166,34 @@ def action_columns(table: Table) -> list[str]:
     return [n for n in table if _bare(n) not in (*TIMES, *FRAMES) and not _is_episode(n)]
 
 
+def _flat(name: str, values: Any) -> dict[str, Any]:
+    """A column, or one for each entry of objects, as ``action.x``.
+
+    Raises:
+        ValueError: its rows have different lengths, or entries of other names.
+    """
+    rows = cast(list[Any], values) if isinstance(values, list) else []
+    if not rows or not isinstance(rows[0], dict):
+        try:
+            return {name: np.asarray(values)}
+        except ValueError:
+            raise ValueError(f"the rows of {name} have different lengths") from None
+    if any(not isinstance(row, dict) or [*row] != [*rows[0]] for row in rows):
+        raise ValueError(f"the rows of {name} have different entries")
+    entries = ((f"{name}.{key}", [_nan(row[key]) for row in rows]) for key in rows[0])
+    return {k: v for entry in entries for k, v in _flat(*entry).items()}
+
+
 def _spread(rows: Mapping[str, Any]) -> Mapping[str, Any]:
     """The columns, with a text that stands once, as in NPZ and JSON, in every row."""
-    arrays = {name: np.asarray(values) for name, values in rows.items()}
+    arrays = {k: v for entry in rows.items() for k, v in _flat(*entry).items()}
     count = max((len(values) for values in arrays.values() if values.ndim), default=0)
     alone = {n: v for n, v in arrays.items() if v.ndim == 0}
     if wrong := next((name for name, value in alone.items() if value.dtype.kind not in "US"), None):
-        raise ValueError(f"{wrong} is {alone[wrong]!s:.80}, but a column has a value per row")
-    return {**rows, **{name: np.repeat(value, count) for name, value in alone.items()}}
+        raise ValueError(
+            f"{wrong} is {alone[wrong]!s:.80}, but a column has a value per row: leave it out"
+        )
+    return {**arrays, **{name: np.repeat(value, count) for name, value in alone.items()}}
 
 
 def _numbered(rows: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
@@ -401,7 +421,7 @@ def _columns(table: Any) -> dict[str, Any]:
         if name in arrays:
             raise ValueError(f"it has two columns called {name or 'nothing'}: name them apart")
         if types.is_nested(column.type):
-            arrays[name] = np.array(column.to_pylist())
+            arrays[name] = column.to_pylist()
         elif types.is_temporal(column.type):
             raise ValueError(f"the column {name} holds dates, not numbers: write times in seconds")
         else:
@@ -454,7 +474,7 @@ def _records(value: Any) -> dict[str, Any]:
     for place, row in enumerate(rows):
         if not isinstance(row, dict) or [*cast(dict[str, Any], row)] != names:
             raise ValueError(f"row {place} (counted from 0) has different columns from the first")
-    return {name: np.array([_nan(row[name]) for row in rows]) for name in names}
+    return {name: [_nan(row[name]) for row in rows] for name in names}
 
 
 def _nan(value: Any) -> Any:

@@ -278,22 +278,22 @@ class VideoFolder:
             return times
         if len(frame_times) - len(times) in (0, 1) and _counts_rows(times):
             return None
-        if self.from_first_row:
-            times = times - times[0] + frame_times[0]
-        span, shown = times[-1] - times[0], frame_times[-1] - frame_times[0]
-        if times[0] <= frame_times[-1] and span > 10 * shown > 0:
+        offset = frame_times[0] - times[0] if self.from_first_row else 0.0
+        rows: NDArray[np.float64] = times + offset
+        span, shown = rows[-1] - rows[0], frame_times[-1] - frame_times[0]
+        if rows[0] <= frame_times[-1] and span > 10 * shown > 0:
             raise DataError(
                 f"the times of {path} span {span:,.4g} s, and the video {shown:.4g} s: in "
                 "milliseconds or nanoseconds, call their column time_ms or time_ns; if they number "
                 "frames, frame"
             )
-        if times[0] > frame_times[-1] or times[-1] < frame_times[0]:
+        if rows[0] > frame_times[-1] or rows[-1] < frame_times[0]:
             raise DataError(
-                f"the times of {path} ({times[0]:g} to {times[-1]:g} s) are not those of the video "
+                f"the times of {path} ({rows[0]:g} to {rows[-1]:g} s) are not those of the video "
                 f"({frame_times[0]:g} to {frame_times[-1]:g} s): give --from-first-row if the "
                 "first row was taken with the first frame"
             )
-        return times
+        return rows
 
     def _samples(
         self, rows: Table, path: Path, times: NDArray[np.float64] | None

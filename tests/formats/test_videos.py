@@ -1,10 +1,13 @@
 """A folder of videos: what is found in it, which column is what, and what is refused by name."""
 
+import json
 import pickle
 from fractions import Fraction
 
 import fsspec
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 from click.testing import CliRunner
 
@@ -241,3 +244,35 @@ def test_numbers_between_other_delimiters_are_refused(tmp_path, row):
 def test_thousands_are_no_text(tmp_path):
     with pytest.raises(DataError, match=r"'1,000\.5', which is not a number"):
         timed(tmp_path, "x,y", lambda k: f'{k},"1,00{k}.5"')
+
+
+NESTED = [{"action": {"x": k, "arm": {"y": -k}}, "reward": 1, "task": "go"} for k in range(8)]
+
+
+@pytest.mark.parametrize("ending", ["json", "jsonl", "parquet"])
+def test_objects_in_rows_are_columns(tmp_path, ending):
+    film(tmp_path / "a.mp4", 0)
+    path = tmp_path / f"a.{ending}"
+    if ending == "parquet":
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(NESTED), path)
+    else:
+        write(path, json.dumps(NESTED) if ending == "json" else "\n".join(map(json.dumps, NESTED)))
+    found = Videos().read(tmp_path)
+    assert found.actions.names == ("action.x", "action.arm.y")
+    assert found.splits[0].actions.values.tolist() == [[k, -k] for k in range(8)]
+    assert found.splits[0].facts == {"task": "go"}
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        ([{"x": [1]}, {"x": [1, 2]}], "the rows of x have different lengths"),
+        ([{"x": {"a": 1}}, {"x": {"b": 1}}], "the rows of x have different entries"),
+        ({"x": [1, 2], "fps": 10}, "fps is 10, but a column has a value per row: leave it out"),
+    ],
+)
+def test_rows_that_are_no_table(tmp_path, rows, sentence):
+    film(tmp_path / "a.mp4", 0)
+    write(tmp_path / "a.json", json.dumps(rows))
+    with pytest.raises(DataError, match=sentence):
+        Videos().read(tmp_path)
