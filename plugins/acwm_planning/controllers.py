@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
 from acwm_core.errors import PluginError, check_shape
-from acwm_planning.futures import GoalCost, History
+from acwm_planning.futures import GoalCost, History, ModelRollouts
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
+from acwm_planning.prior import PolicyPrior
 from acwm_planning.scripts import check_bounds, script
 from acwm_planning.search import SearchPlanner
 
@@ -148,6 +149,10 @@ class PlanningController(Controller):
             None if action_std is None else torch.tensor(action_std, dtype=torch.float32)
         )
         self.decisions: list[Decision] = []
+        prior = planner.prior if isinstance(planner, SearchPlanner) else None
+        self._prior: PolicyPrior | None = None
+        if prior is not None and isinstance(rollouts, ModelRollouts):
+            self._prior = PolicyPrior(prior, rollouts)
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
         rng = environment.episode_spec.rng("planner")
@@ -167,6 +172,8 @@ class PlanningController(Controller):
             seed: of this episode.
         """
         self._planner.reset()
+        if self._prior is not None:
+            self._prior.begin(task, goal)
         self.decisions, self.still = [], still
         self._goal_cost = GoalCost(self._cost, task, goal)
         self._low, self._high = torch.tensor(action.low), torch.tensor(action.high)
@@ -203,6 +210,10 @@ class PlanningController(Controller):
         half = (self._high - self._low) / 2
         action_std = None if self._action_std is None else self._action_std / half
         self._planner.search_near((still - self._low) / half - 1, action_std)
+        if self._prior is not None:
+            length = self._planner.horizon * self._planner.action_block
+            actions = self._prior.actions(history, self.still, length)
+            self._planner.propose((actions - self._low) / half - 1)
 
     def _valid_actions(self, plan: Plan) -> NDArray[np.float32]:
         """The actions `[T, A]` of a valid plan.

@@ -299,7 +299,11 @@ class ModelRollouts:
         frames = given.codec.decode(latents)[0]
         return frames[given.frames :][: len(actions)].cpu()
 
-    def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
+    def recent(self, history: History, still: NDArray[np.float32]) -> tuple[Video, Actions]:
+        """The real frames `[1, K, 3, H, W]` to start from, and the raw actions `[1, T, A]` since.
+
+        The first K − 1 actions lie between the frames.
+        """
         world = self.world_model
         context, stride = world.context_frames, world.codec.temporal_stride
         past = min(self._past, len(history.actions) // stride) * stride
@@ -310,8 +314,12 @@ class ModelRollouts:
         device = world.action_low.device
         video = as_clip(np.stack(frames[first : first + context]))[None].to(device)
         recent = np.array(actions[first:], np.float32).reshape(1, context - 1 + past, len(still))
-        codec = world.codec.with_reference(video[:, -1])
-        return _Given(codec, world.encode(video), torch.from_numpy(recent))
+        return video, torch.from_numpy(recent).to(device)
+
+    def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
+        video, recent = self.recent(history, still)
+        codec = self.world_model.codec.with_reference(video[:, -1])
+        return _Given(codec, self.world_model.encode(video), recent)
 
     def _futures(
         self,

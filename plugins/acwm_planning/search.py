@@ -88,6 +88,8 @@ class SearchPlanner(Planner):
             motion now. If actions are positions, the latter searches paths of moderate speed.
         actions_per_plan: number of actions to take before planning again; one block by default.
         warm_start: start from the rest of the previous plan, instead of no motion.
+        prior: folder of a trained policy; the search starts from what it would do in the model,
+            which is a candidate too.
 
     Raises:
         RecipeError: a number is below 1, or more actions are taken than planned.
@@ -101,6 +103,7 @@ class SearchPlanner(Planner):
         interpolation: Literal["hold", "linear"] = "hold",
         actions_per_plan: int | None = None,
         warm_start: bool = False,
+        prior: str | None = None,
     ) -> None:
         at_least("horizon", horizon, 1)
         at_least("action_block", action_block, 1)
@@ -111,8 +114,9 @@ class SearchPlanner(Planner):
                 "that are planned (horizon · action_block)"
             )
         self.horizon, self.action_block, self.actions_per_plan = horizon, action_block, count
-        self.interpolation, self.warm_start = interpolation, warm_start
+        self.interpolation, self.warm_start, self.prior = interpolation, warm_start, prior
         self._last: Tensor | None = None
+        self._proposal: Tensor | None = None
         self._still: Tensor | None = None
         self.action_std: Tensor | None = None
 
@@ -135,6 +139,11 @@ class SearchPlanner(Planner):
         self._still = still.clamp(-1, 1)
         self.action_std = None if action_std is None else action_std.clamp(MIN_ACTION_STD, 1)
 
+    def propose(self, actions: Tensor) -> None:
+        """Start the next search from actions `[horizon · action_block, A]`, scaled to [-1, 1]."""
+        blocks = actions.unflatten(0, (self.horizon, self.action_block))
+        self._proposal = blocks.mean(1) if self.interpolation == "hold" else blocks[:, -1]
+
     def plan(self, cost: RolloutCost, low: Tensor, high: Tensor, rng: torch.Generator) -> Plan:
         """See `Planner.plan`.
 
@@ -143,7 +152,10 @@ class SearchPlanner(Planner):
         """
         previous = self._still_action(len(low)) if self.interpolation == "linear" else None
         search = Search(cost, low, high, self.action_block, previous)
+        if self._proposal is not None:
+            search(self._proposal[None])
         self.search(search, self._start(len(low)), rng)
+        self._proposal = None
         if search.best is None:
             raise RecipeError(
                 "no candidate has a finite cost: the model's predictions are not finite, or the "
@@ -169,7 +181,9 @@ class SearchPlanner(Planner):
         """Evaluate candidates `[N, H, A]` with `search`, starting around `start` `[H, A]`."""
 
     def _start(self, action_size: int) -> Tensor:
-        """Where to start: no motion, or with `warm_start` the rest of the previous plan."""
+        """Where to start: the proposal, the rest of the previous plan, or no motion."""
+        if self._proposal is not None:
+            return self._proposal.clone()
         start = self._still_action(action_size).expand(self.horizon, -1).clone()
         if self.warm_start and self._last is not None:
             start = self.shifted(self._last)
