@@ -16,7 +16,9 @@ POLICY = ExistingFolder(
 NAMES = {
     "trained": "trained policy",
     "dream": "the same, in the dream",
+    "beside": "the policy beside it",
     "solution": "script that knows the goal",
+    "behaviour": "behaviour policy",
     "random": "random actions",
     "still": "no motion",
 }
@@ -103,15 +105,22 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
 @click.option(
     "--run", metavar="MODEL", help="Model to dream in; by default the one it was trained with."
 )
+@click.option(
+    "--beside",
+    type=POLICY,
+    metavar="POLICY",
+    help="Another policy for the task to compare with, e.g. one trained in the simulator.",
+)
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; POLICY/evaluation by default.")
 @click.option("--device", default="auto", help="Device of the model.")
 def evaluate(folder: Path, **options: Any) -> None:
     """Measure how often a trained policy succeeds in the simulator.
 
-    All rows begin at the same starts, of the test split: the policy, random actions, no motion, and
-    the script that knows the goal if the task has one; and the policy in the model. How much better
-    it is there is the gap: what it gains from errors of the model. The policy observes the states
-    of the simulator. If it is interrupted, run the same command again to continue.
+    All rows begin at the same starts, of the test split: the policy, another one --beside it,
+    random actions, no motion, the behaviour policy that collects data, and the script that knows
+    the goal if the task has one; and the policy in the model. How much better it is there
+    is the gap: what it gains from errors of the model. The policy observes the states of the
+    simulator. If it is interrupted, run the same command again to continue.
     """
     from acwm_policy.evaluate import evaluate_policy
 

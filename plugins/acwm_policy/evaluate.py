@@ -33,7 +33,7 @@ from acwm_planning.controllers import (
 from acwm_planning.episode import load_task, play, spec_of_seed, start_of
 from acwm_planning.futures import History
 from acwm_planning.left_out import LeftOut
-from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy
+from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy, policy_for
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_planning.runner import EpisodeTable, play_missing
 from acwm_planning.table import EpisodeLine, summarise
@@ -43,10 +43,10 @@ from acwm_policy.scenes import DreamScenes
 EVALUATION, EVALUATION_FILE = "evaluation", "evaluation.json"
 """Folder of the results within a policy's folder, and the file with the summary."""
 
-TRAINED, DREAM = "trained", "dream"
-"""Rows of the policy in the simulator, and in the model."""
+TRAINED, DREAM, BESIDE = "trained", "dream", "beside"
+"""Rows of the policy in the simulator and in the model, and of another policy in the simulator."""
 
-ROWS = (TRAINED, DREAM, "solution", "random", "still")
+ROWS = (TRAINED, DREAM, BESIDE, "solution", "behaviour", "random", "still")
 """Rows of the table, the first one first."""
 
 
@@ -79,6 +79,7 @@ class EvaluatedEpisodes(EpisodeTable):
         bundle: the model that it is dreamt in, on its device.
         environment: the simulator with the task.
         rows: of `ROWS`.
+        beside: another policy for the same task, for the row of that name.
     """
 
     def __init__(
@@ -87,13 +88,16 @@ class EvaluatedEpisodes(EpisodeTable):
         bundle: RunBundle,
         environment: TaskEnvironment,
         rows: Sequence[str],
+        beside: SavedPolicy | None = None,
     ) -> None:
         super().__init__(rows)
         self._policy, self._bundle, self._environment = policy, bundle, environment
         repeat = policy.card.repeat
         self._controllers = {
             TRAINED: StateController(policy),
+            BESIDE: StateController(beside or policy),
             "solution": PolicyController.scripted(solves=True),
+            "behaviour": PolicyController.scripted(solves=False),
             "random": RandomController(repeat),
             "still": StillController(),
         }
@@ -155,6 +159,7 @@ def evaluate_policy(
     *,
     seeds: Sequence[int],
     run: str | Path | None = None,
+    beside: Path | None = None,
     out: Path | None = None,
     device: str = "auto",
     progress: bool = False,
@@ -165,6 +170,7 @@ def evaluate_policy(
         folder: the policy's folder.
         seeds: numbers of episodes of the test split, the same for all rows.
         run: the model to dream in; by default the one that the policy was trained with.
+        beside: folder of another policy for the same task, to compare with.
         out: folder of the results; `EVALUATION` within `folder` by default.
         device: device of the model.
         progress: show a progress bar.
@@ -192,11 +198,17 @@ def evaluate_policy(
         "policy": file_sha256(folder / POLICY_FILE),
         "weights": file_sha256(RunFolder(find_run(model)).weights),
     }
+    other = None
+    if beside is not None:
+        other = policy_for(str(beside), bundle.card, task.name)
+        identity["beside"] = file_sha256(beside / POLICY_FILE)
     inner = make_environment(bundle.card.name, {"size": bundle.card.frame_size})
     with closing(inner):
         environment = TaskEnvironment(inner, task)
-        rows = [row for row in ROWS if row != DREAM or dreams(bundle, policy)]
-        table = EvaluatedEpisodes(policy, bundle, environment, rows)
+        without = {DREAM} if not dreams(bundle, policy) else set[str]()
+        without |= {BESIDE} if other is None else set()
+        rows = [row for row in ROWS if row not in without]
+        table = EvaluatedEpisodes(policy, bundle, environment, rows, other)
         results = ResumableResults(where, identity, kind=EpisodeLine)
         with results.adding():
             label = f"evaluating at {task.name}" if progress else ""

@@ -33,13 +33,15 @@ def reachable(seed):
 
 @needs("stable_baselines3")
 def test_the_best_policy_solves_what_can_be_solved(run, policy, capsys):
+    beside = ["--beside", str(policy)]
     with pytest.raises(SystemExit) as ended:
-        main(["policy", "evaluate", str(policy), "--run", str(run), "--seeds", "0..7"])
+        main(["policy", "evaluate", str(policy), "--run", str(run), "--seeds", "0..7", *beside])
     assert ended.value.code == 0
     said = capsys.readouterr().out
     found = json.loads((policy / "evaluation" / "evaluation.json").read_text())
     rows = {row["row"]: row for row in found["rows"]}
-    assert [*rows] == ["trained", "dream", "solution", "random", "still"]
+    assert [*rows] == ["trained", "dream", "beside", "solution", "behaviour", "random", "still"]
+    assert rows["beside"]["successes"] == rows["trained"]["successes"]  # it is the same
     can = [seed for seed in range(8) if reachable(seed)]
     assert rows["trained"]["successes"] == rows["solution"]["successes"] == len(can)
     assert rows["still"]["successes"] == 0

@@ -2,8 +2,11 @@
 
 import csv
 import json
+import signal
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,8 @@ from acwm_policy.settings import PolicySettings, settings_of
 from tests import tiny
 from tests.extras import needs
 from tests.learning.world import straight
+
+ROOT = Path(__file__).parents[2]
 
 SMALL = {
     "learning_rate": 3e-3,
@@ -94,6 +99,45 @@ def test_a_killed_training_ends_as_one_that_was_not(run, tmp_path, monkeypatch, 
     kept, usual = ([row[:-1] for row in curve] for curve in curves)
     assert kept == usual
     assert len(kept) > 3
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from acwm_policy import train as module
+from tests.learning import world
+from tests.learning.test_training import FEW, train
+
+world.register()
+save, saved = module._Keeper.save, []
+
+def save_and_die(self):
+    save(self)
+    saved.append(self)
+    if len(saved) == 2 and sys.argv[3] == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+
+module._Keeper.save = save_and_die
+run, out = map(Path, sys.argv[1:3])
+train(run, out, steps=320, algorithm="backprop", parameters=FEW["backprop"])
+"""
+
+
+@pytest.mark.ci
+def test_a_process_that_is_killed_loses_nothing(run, tmp_path):
+    """By SIGKILL, in processes of their own: the same bits as of one that lived."""
+
+    def ends(name, fate):
+        command = [sys.executable, "-c", KILLED, str(run), str(tmp_path / name), fate]
+        return subprocess.run(command, check=False, cwd=ROOT, capture_output=True).returncode
+
+    assert ends("killed", "dies") == -signal.SIGKILL
+    assert 0 < SavedPolicy.read(tmp_path / "killed").card.training["steps"] < 320
+    assert ends("killed", "lives") == ends("whole", "lives") == 0
+    one, other = (
+        SavedPolicy.read(tmp_path / name)._network.state_dict() for name in ("killed", "whole")
+    )
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 @needs("stable_baselines3")
