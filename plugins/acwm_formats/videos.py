@@ -276,12 +276,13 @@ class VideoFolder:
         """The times of rows on the clock of the video; None if they count its frames."""
         if times is None or not len(frame_times):
             return times
-        if len(frame_times) - len(times) in (0, 1) and _counts_rows(times):
+        counted = _counts_rows(times - times[0] if self.from_first_row else times)
+        if counted and len(frame_times) - len(times) in (0, 1):
             return None
         offset = frame_times[0] - times[0] if self.from_first_row else 0.0
         rows: NDArray[np.float64] = times + offset
         span, shown = rows[-1] - rows[0], frame_times[-1] - frame_times[0]
-        if rows[0] <= frame_times[-1] and span > 10 * shown > 0:
+        if rows[0] <= frame_times[-1] and span > (2 if counted else 10) * shown > 0:
             raise DataError(
                 f"the times of {path} span {span:,.4g} s, and the video {shown:.4g} s: in "
                 "milliseconds or nanoseconds, call their column time_ms or time_ns; if they number "

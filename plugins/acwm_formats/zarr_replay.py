@@ -135,7 +135,7 @@ class ZarrReplay(Format):
             buffer.episodes(), layout, exact(rate), pair(pixel_range), channels
         )
         used = {*cameras, *action, *kept}
-        left = [name for name in arrays if name not in used]
+        left = [name for name in arrays if name not in used] + buffer.groups()
         return RecordedDataset(
             name=word(Path(root)),
             splits=recordings,
@@ -229,6 +229,11 @@ class Buffer(ArrayStore):
         with damage_of(self.path / group), _pointers_named(self.path / group):
             arrays = self._group[group].arrays()
             return sorted(n for n, a in arrays if a.dtype.kind in kinds and not n.startswith("."))
+
+    def groups(self) -> list[str]:
+        """The names of the groups in ``data``, none of which is read."""
+        with damage_of(self.path / "data"), _pointers_named(self.path / "data"):
+            return sorted(f"{name}/" for name, _ in self._group["data"].groups())
 
     def array(self, name: str) -> Any:
         """An array of numbers or texts whose codecs run no code.

@@ -227,6 +227,22 @@ def test_times_that_number_the_frames_are_no_seconds(tmp_path, first):
     assert found.times is None
 
 
+def test_a_number_of_rows_in_one_table_for_all_is_no_time(tmp_path):
+    for place, name in enumerate("ab"):
+        film(tmp_path / f"{name}.mp4", place)
+    lines = [f"{'ab'[k // 8]},{k},{k}" for k in range(16)]
+    write(tmp_path / "all.csv", "\n".join(["video,t,x", *lines]))
+    found = Videos().read(tmp_path, from_first_row=True).splits
+    assert [found[place].actions.times for place in (0, 1)] == [None, None]
+
+
+def test_a_number_of_rows_that_lacks_some_is_refused(tmp_path):
+    film(tmp_path / "a.mp4", 0)
+    write(tmp_path / "a.csv", "\n".join(["t,x", *[f"{k},{k}" for k in range(6)]]))
+    with pytest.raises(DataError, match="span 5 s, and the video"):
+        Videos().read(tmp_path).splits[0]
+
+
 @pytest.mark.parametrize("head", ["time,x", "t,x"])
 def test_times_in_another_unit_are_refused(tmp_path, head):
     with pytest.raises(
