@@ -49,13 +49,13 @@ LAST = frozenset(
     f"{name}{plural}"
     for name in ("terminal", "timeout", "done", "termination", "truncation", "is_last")
     for plural in ("", "s")
-) | {"terminated", "truncated", "is_terminal", "last"}
+) | {"dones_float", "terminated", "truncated", "is_terminal", "last"}
 FIRST = frozenset({"is_first", "first", "reset", "resets", "is_reset"})
 STEP_TYPE = "step_type"
 """0 in the first row of an episode, as `dm_env` has it."""
 
 GOING_ON = frozenset(
-    {"discount", "discounts", "continue", "continues", "not_done", "not_dones", "mask", "masks"}
+    {"discount", "discounts", "continue", "continues", "not_done", "not_dones", "nonterminals"}
 )
 """Flags that are 0 in the last row of an episode."""
 INDEX = ("episode_data_index", "episodes", "episode", "meta")
@@ -107,7 +107,8 @@ def bounds_of(
     whole = {name: v for name, v in known.items() if v.dtype.kind in "iuf" and len(v)}
     edges = _edges(whole, count) or _runs(known, count, where)
     if edges is None and flags:
-        edges = _flagged(known, count) or _counted(whole, count) or _fitting(whole, count)
+        ways = (_flagged(known, count), _counted(whole, count), _fitting(whole, count))
+        edges = next((way for way in ways if way and len(way) > 1), None)  # flags may never be set
     if edges is None:
         return None
     ordered = sorted(edges)

@@ -45,6 +45,10 @@ SAYS = {
     "resets": {"reset": FIRST},
     "kinds of steps": {"step_type": np.where(FIRST, 0, 1 + LAST)},
     "a scene": {"scene_id": NUMBERS},
+    "counters beside flags that are never set": {
+        "terminals": np.zeros(COUNT, bool),
+        "step": np.arange(COUNT) - STARTS[NUMBERS],
+    },
 }
 
 
@@ -254,6 +258,7 @@ def test_times_that_begin_anew_tell_episodes_apart(tmp_path):
         {"keyframes": [0, 10, 25]},
         {"limits": [1, 2, 3]},
         {"stage": NUMBERS},
+        {"mask": ROWS[:, 1]},
         {"t": np.arange(COUNT)},
     ],
 )
