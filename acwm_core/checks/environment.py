@@ -28,6 +28,9 @@ from acwm_core.env.symmetry import Symmetry, group
 CLOSE = 0.01
 """Mean difference of two frames, as a fraction of white, that counts as hardly visible."""
 
+UNLABELLED = ("unlabelled",)
+"""The instances of a world that shows no masks, such as one of Gymnasium or recordings."""
+
 SOME = BEGINNING // 2
 """Frames that are simulated once more to show that nothing but spec and actions counts."""
 
@@ -68,7 +71,8 @@ class EnvironmentChecks(TaskChecks):
             expect(getattr(card, attribute), f"the card's {attribute} is empty")
         expect(card.horizon >= 2, f"a horizon of {card.horizon} frames leaves no action to take")
         expect(action.size > 0, "the action has no dimension")
-        expect(card.instances[1:], "the card names nothing but the background in `instances`")
+        named = card.instances[1:] or card.instances == UNLABELLED
+        expect(named, "the card names nothing but the background in `instances`")
         for names in (action.names, [f.name for f in card.factors], [s.name for s in card.state]):
             expect(len(set(names)) == len(names), f"a name occurs twice in {', '.join(names)}")
 
@@ -80,6 +84,8 @@ class EnvironmentChecks(TaskChecks):
     def factors_have_ranges(self) -> None:
         """Declare factors whose nominal value is in distribution and whose OoD values are not."""
         card = self.card
+        if card.instances == UNLABELLED and not card.factors:
+            raise NotTried("it is a world of others, whose card declares no factors")
         expect(card.factors, "the card declares no factor of variation")
         for factor in card.factors:
             expect(factor.train and factor.ood, f"{factor.name!r} lacks a train or OoD range")
@@ -124,6 +130,8 @@ class EnvironmentChecks(TaskChecks):
         expect_equal("masks are", masks.shape[1:], self.environment.frame_size)
         expect_equal("masks are", masks.dtype, np.dtype(np.uint8))
         expect(masks.max() < len(names), f"mask id {masks.max()} has no name in `instances`")
+        if names == UNLABELLED:
+            raise NotTried("its instances are unlabelled")
         expect(masks.any(), "the mask shows nothing but background")
 
     def states_are_of_their_kinds(self) -> None:

@@ -18,14 +18,28 @@ from acwm_templates.kinds import KINDS
     "--environment", default="push_cube", help="Of a task: the environment that it is for."
 )
 @click.option("--weights", type=FOLDER, help="Of an estimator: a file of `acwm train-estimator`.")
-def new(kind: str, name: str, out: Path | None, environment: str, weights: Path | None) -> None:
+@click.option(
+    "--from-gym",
+    "gym",
+    metavar="ID",
+    help="Of an environment: one of Gymnasium to wrap, as in gymnasium.make; module:Name-v0 "
+    "imports a module first.",
+)
+def new(
+    kind: str,
+    name: str,
+    out: Path | None,
+    environment: str,
+    weights: Path | None,
+    gym: str | None,
+) -> None:
     """Start your own plugin.
 
     Writes a working package with a component called NAME (in snake_case) and tests; change it
     piece by piece. KIND is one of:
 
     \b
-      environment   a world simulated and drawn with numpy
+      environment   a world simulated and drawn with numpy, or one of Gymnasium (--from-gym)
       scene         a world in 3-D: MuJoCo and the renderer of acwm
       codec         video to latents and back
       model         predicts latents
@@ -38,6 +52,7 @@ def new(kind: str, name: str, out: Path | None, environment: str, weights: Path 
     """
     from acwm_templates.package import package_of, write_package
 
-    folder = write_package(kind, name, out or Path(package_of(kind, name)), environment, weights)
+    place = out or Path(package_of(kind, name))
+    folder = write_package(kind, name, place, environment, weights, gym)
     checked = f"{environment}.{name}" if kind == "task" else name
     click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {checked}")

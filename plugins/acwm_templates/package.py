@@ -25,7 +25,12 @@ def package_of(kind: str, name: str) -> str:
 
 
 def write_package(
-    kind: str, name: str, folder: Path, environment: str, weights: Path | None = None
+    kind: str,
+    name: str,
+    folder: Path,
+    environment: str,
+    weights: Path | None = None,
+    gym: str | None = None,
 ) -> Path:
     """Write the package of a component. Either all files appear or none.
 
@@ -35,6 +40,7 @@ def write_package(
         folder: folder to create.
         environment: for a task, the environment that it is for.
         weights: for an estimator, those that `acwm train-estimator` wrote.
+        gym: for an environment, the id of one of Gymnasium that it wraps.
 
     Raises:
         RecipeError: the name is invalid or taken, or the folder exists.
@@ -42,19 +48,10 @@ def write_package(
         DataError: the weights cannot be read.
     """
     registers = KINDS[kind].registers
-    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
-        raise RecipeError(f"{name!r} cannot be its name: use snake_case, as in open_drawer")
     whole = f"{environment}.{name}" if kind == "task" else name
-    if whole in catalog().registry(registers):
-        raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
     package = package_of(kind, name)
-    if importlib.util.find_spec(package) is not None:
-        raise RecipeError(f"a package {package} is installed already; choose another name")
-    if weights and (kind != "estimator" or not weights.is_file()):
-        what = "there is no such file" if kind == "estimator" else f"a {kind} has none"
-        raise RecipeError(f"--weights {weights}: {what}")
-    if weights and "layout" not in training_record(weights):
-        raise RecipeError(f"--weights {weights}: `acwm train-estimator` did not write it")
+    _check_name(registers, whole, name, package)
+    _check_options(kind, weights, gym)
     if folder.exists():
         raise RecipeError(f"{folder} exists already; choose another --out")
     about: dict[str, Any] = {
@@ -70,7 +67,9 @@ def write_package(
     }
     if kind == "task":
         about |= _field_of(environment)
-    own = "estimator_of_weights" if weights else kind
+    if gym:
+        about |= _described(gym, name)
+    own = "gymnasium" if gym else "estimator_of_weights" if weights else kind
     written = {path: text for each in ("package", own) for path, text in _rendered(each, about)}
     with made_whole(folder) as made:
         for path, text in written.items():
@@ -80,6 +79,25 @@ def write_package(
         if weights:
             shutil.copyfile(weights, made / package / f"{name}.safetensors")
     return folder
+
+
+def _check_name(registers: str, whole: str, name: str, package: str) -> None:
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        raise RecipeError(f"{name!r} cannot be its name: use snake_case, as in open_drawer")
+    if whole in catalog().registry(registers):
+        raise RecipeError(f"{registers} {whole!r} is installed already; choose another name")
+    if importlib.util.find_spec(package) is not None:
+        raise RecipeError(f"a package {package} is installed already; choose another name")
+
+
+def _check_options(kind: str, weights: Path | None, gym: str | None) -> None:
+    if weights and (kind != "estimator" or not weights.is_file()):
+        what = "there is no such file" if kind == "estimator" else f"a {kind} has none"
+        raise RecipeError(f"--weights {weights}: {what}")
+    if weights and "layout" not in training_record(weights):
+        raise RecipeError(f"--weights {weights}: `acwm train-estimator` did not write it")
+    if gym and kind != "environment":
+        raise RecipeError(f"--from-gym {gym}: only an environment can be made from one")
 
 
 def _rendered(folder: str, about: dict[str, Any]) -> list[tuple[str, str]]:
@@ -111,6 +129,25 @@ def _imported(text: str) -> set[str]:
     """The names that a module imports from acwm itself."""
     lines = re.findall(r"^from acwm_(?:core|planning|sim)\S* import (.*)$", text, re.M)
     return {name for line in lines for name in line.split(", ")}
+
+
+def _described(gym: str, name: str) -> dict[str, Any]:
+    """What is written of an environment of Gymnasium, which is made for it once."""
+    from acwm_templates.gymnasium_card import card_of
+
+    card = card_of(gym, name)
+    return {
+        "env_id": gym,
+        "card": card,
+        "low": _tuple_text(card.action.low),
+        "high": _tuple_text(card.action.high),
+        "summary": card.summary.removesuffix("."),
+    }
+
+
+def _tuple_text(values: tuple[float, ...]) -> str:
+    """A tuple as it is written, short if all values are equal."""
+    return f"({values[0]!r},) * {len(values)}" if len({*values}) == 1 else repr(values)
 
 
 def _field_of(environment: str) -> dict[str, Any]:

@@ -13,6 +13,9 @@ CONTEXT = (-1, 0, 1, 2)
 WIDTHS = (32, 64, 96, 128)
 GRID, HIDDEN = 4, 256
 
+CHANGE = 4.0
+"""By how much changes between frames are enlarged, which are small beside what stands still."""
+
 
 class InverseDynamics(nn.Module):
     """Reads an action from frames before and after it.
@@ -37,8 +40,10 @@ class InverseDynamics(nn.Module):
         Args:
             frames: `[B, len(CONTEXT), 3, h, w]` uint8.
         """
-        pixels = frames.flatten(1, 2).float() / 127.5 - 1
-        seen = nn.functional.adaptive_avg_pool2d(self.see(pixels), GRID)
+        pixels = frames.float() / 127.5 - 1
+        changes = CHANGE * (pixels[:, 1:] - pixels[:, :-1])
+        inputs = torch.cat([pixels[:, :1], changes], 1).flatten(1, 2)
+        seen = nn.functional.adaptive_avg_pool2d(self.see(inputs), GRID)
         mean, log_variance = self.read(seen.flatten(1)).chunk(2, 1)
         return mean, log_variance.clamp(-8, 4)
 
