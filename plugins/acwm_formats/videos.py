@@ -45,6 +45,10 @@ from acwm_formats.timeline import (
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
+OWNER = r"(ep|eps|episode|traj|trajectory|demo|rollout|trial|take|run|seq|sequence|clip)s?[\W_]*\d"
+"""How names of pictures begin whose first number is that of their episode."""
+
+
 class VideoEpisode(NamedTuple):
     """Where one episode lies.
 
@@ -377,7 +381,9 @@ def _tabled(name: str, cameras: Mapping[str, Path], tables: Sequence[Path]) -> V
 
 
 def _grouped(folder: Path, table: Path | None) -> list[VideoEpisode]:
-    """The episodes of a folder whose pictures are numbered anew in each, as ``ep_0_step_0.png``.
+    """The episodes of a folder whose pictures are numbered in each, as ``ep_0_step_0.png``.
+
+    They are numbered anew; or on, if the name says what its first number counts, as ``ep0_000``.
 
     Raises:
         DataError: they are the pictures of several cameras.
@@ -388,7 +394,14 @@ def _grouped(folder: Path, table: Path | None) -> list[VideoEpisode]:
         groups.setdefault(_begins(path), []).append(int(number[1]) if number else -1)
     first = next(iter(groups.values()), [])
     anew = all(n == [*range(n[0], n[0] + len(n))] and n[0] == first[0] for n in groups.values())
-    if len(groups) < 2 or not anew or not all(re.search(r"\d", begins) for begins in groups):
+    every = [number for numbers in groups.values() for number in numbers]
+    named = all(re.match(OWNER, begins.lower()) for begins in groups)
+    on = named and every == [*range(every[0], every[0] + len(every))]
+    if (
+        len(groups) < 2
+        or not (anew or on)
+        or not all(re.search(r"\d", begins) for begins in groups)
+    ):
         return []
     if re.match(r"(cam|camera|view|eye)", next(iter(groups)).lower()):
         raise DataError(f"{folder} has pictures of several cameras: put each into a folder")

@@ -192,6 +192,7 @@ NAMES = {
     "with zeros": "episode_{e:03d}_frame_{s:06d}.png",
     "two numbers": "{e}_{s}.png",
     "from one": "traj{e1}-{s1}.png",
+    "a number that goes on": "Take {e} {k:04d}.png",
 }
 
 
@@ -202,7 +203,7 @@ def pictured(folder, pattern):
     ):
         e = int(NUMBERS[place])
         s = int(place - STARTS[e])
-        path.rename(folder / f"x{pattern.format(e=e, s=s, e1=e + 1, s1=s + 1)}")
+        path.rename(folder / f"x{pattern.format(e=e, s=s, e1=e + 1, s1=s + 1, k=place)}")
     for path in [*folder.iterdir()]:
         path.rename(folder / path.name.removeprefix("x"))
 
@@ -231,6 +232,9 @@ def test_pictures_by_time_or_camera_are_no_episodes(tmp_path):
     for place, path in enumerate(sorted(folder.iterdir())):
         path.rename(folder / f"{1700000000 + place // 2}_{place * 499 % 1000}.png")
     (tmp_path / "a.csv").write_text("x\n" + "\n".join("123456"))
+    assert len(Videos().read(tmp_path, rate=10).splits) == 1
+    for place, path in enumerate(sorted(folder.iterdir())):
+        path.rename(folder / f"s{place // 2}_{place}.png")
     assert len(Videos().read(tmp_path, rate=10).splits) == 1
     for place, path in enumerate(sorted(folder.iterdir())):
         path.rename(folder / f"cam{place % 2}_{place // 2}.png")
