@@ -396,12 +396,8 @@ def _grouped(folder: Path, table: Path | None) -> list[VideoEpisode]:
     anew = all(n == [*range(n[0], n[0] + len(n))] and n[0] == first[0] for n in groups.values())
     every = [number for numbers in groups.values() for number in numbers]
     named = all(re.match(OWNER, begins.lower()) for begins in groups)
-    on = named and every == [*range(every[0], every[0] + len(every))]
-    if (
-        len(groups) < 2
-        or not (anew or on)
-        or not all(re.search(r"\d", begins) for begins in groups)
-    ):
+    numbered = anew or (named and bool((np.diff(every) == 1).all()))
+    if len(groups) < 2 or not numbered or not all(re.search(r"\d", b) for b in groups):
         return []
     if re.match(r"(cam|camera|view|eye)", next(iter(groups)).lower()):
         raise DataError(f"{folder} has pictures of several cameras: put each into a folder")
