@@ -302,7 +302,7 @@ class ModelRollouts:
     def recent(self, history: History, still: NDArray[np.float32]) -> tuple[Video, Actions]:
         """The real frames `[1, K, 3, H, W]` to start from, and the raw actions `[1, T, A]` since.
 
-        The first K − 1 actions lie between the frames.
+        The first K − 1 actions lie between the frames. Actions are on the CPU.
         """
         world = self.world_model
         context, stride = world.context_frames, world.codec.temporal_stride
@@ -314,7 +314,7 @@ class ModelRollouts:
         device = world.action_low.device
         video = as_clip(np.stack(frames[first : first + context]))[None].to(device)
         recent = np.array(actions[first:], np.float32).reshape(1, context - 1 + past, len(still))
-        return video, torch.from_numpy(recent).to(device)
+        return video, torch.from_numpy(recent)
 
     def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
         video, recent = self.recent(history, still)

@@ -60,6 +60,7 @@ class PolicyPrior:
         """
         world, policy = self._rollouts.world_model, self._policy
         video, recent = self._rollouts.recent(history, still)
+        recent = recent.to(video.device)
         stride, between = world.codec.temporal_stride, video.shape[1] - 1
         stream = world.stream_states(video, recent[:, :between])
         policy.reset(self._goal)
