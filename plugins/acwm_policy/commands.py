@@ -158,8 +158,8 @@ def print_evaluation(found: dict[str, Any]) -> None:
     gap = found["gap"]
     if gap is None:
         click.echo(
-            "no row in the dream: the model does not predict all that the policy observes, or moves "
-            "at another rate (observe=[…] chooses fields)"
+            "no row in the dream: the model does not predict all that the policy observes, or "
+            "moves at another rate (observe=[…] chooses fields)"
         )
         return
     about = "" if gap["low"] is None else f" [{gap['low']:+.0%}, {gap['high']:+.0%}]"
