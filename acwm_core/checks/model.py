@@ -260,6 +260,10 @@ class DynamicsChecks(PredictionTrial):
         passed = torch.cat([carried.advance(step) for step in steps], 1)
         error = batch_error(whole.nan_to_num(), passed.nan_to_num())
         expect(error < 1e-3, f"the carried states differ by {error:.2g}")
+        alone = begun.picked(torch.arange(batch)).only([0])
+        first = torch.cat([alone.advance(step)[..., 0] for step in steps], 1)
+        error = batch_error(whole[..., 0].nan_to_num(), first.nan_to_num())
+        expect(error < 1e-3, f"for who needs the first value alone, it differs by {error:.2g}")
         now = carried.current.allclose(passed[:, -1], 1e-4, 1e-4, equal_nan=True)
         expect(now, "`current` is not the last of the states")
         carried.put(last, begun.picked(last))  # one begins anew while the others go on

@@ -388,6 +388,13 @@ class CarriedStates(ABC):
     def put(self, rows: Tensor, others: CarriedStates) -> None:
         """Replace the scenes of these numbers `[N]` by the N scenes of others."""
 
+    def only(self, columns: Collection[int]) -> CarriedStates:
+        """The same scenes for who needs these of the S values alone: the others may become NaN.
+
+        A model that moves some things whatever the others do saves the work of the others.
+        """
+        return self
+
 
 class Cache(ABC):
     """State that a causal denoiser keeps of earlier latent frames, in constant memory.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol, cast
 
 import torch
@@ -103,6 +103,19 @@ class StateStream:
         other = copy.copy(self)
         other._recent, other._known = self._recent[rows.to(self._recent.device)], self._known[rows]
         other._states = self._states.picked(rows)
+        return other
+
+    def only(self, fields: Collection[str]) -> StateStream:
+        """The same scenes for who needs these fields alone: the others may become NaN.
+
+        Raises:
+            KeyError: the model predicts no field of this name.
+        """
+        size = self._states.current.shape[1]
+        numbers = self._world.named_states(torch.arange(size).expand(1, 1, size))
+        columns = {int(number) for name in fields for number in numbers[name].flatten()}
+        other = copy.copy(self)
+        other._states = self._states.only(columns)
         return other
 
     def put(self, rows: Tensor, others: StateStream) -> None:

@@ -30,7 +30,7 @@ class Edge(Task):
     tolerance = 0.05
     max_steps = 63
     # A picture hardly shows how far away the edge is, and most of it is cloth.
-    planning = ("cost=state",)
+    planning = ("cost=state", "past=2", "planner.candidates=256")
 
     def sample_goal(self, environment: Environment, rng: np.random.Generator) -> Goal:
         """Draw a goal beyond the sphere and carry the edge there."""

@@ -53,7 +53,7 @@ def axis_to_post(k: int, seen: Observation, start: States) -> Array:
     return points_to_post(points, place, radius, height)
 
 
-def _arm_to_post(k: int, seen: Observation, start: States) -> Array:
+def arm_to_post(k: int, seen: Observation, start: States) -> Array:
     """Distance from the arm to a post, with the arm as thick as at its thinnest point."""
     return axis_to_post(k, seen, start) - LIMB_RADIUS
 
@@ -85,7 +85,7 @@ ROBOT_ARM = Physics(
             for k, name in enumerate(GOAL_NAMES)
         ),
         *(
-            Gap("arm-post", ("arm", name), partial(_arm_to_post, k), solid=0.0)
+            Gap("arm-post", ("arm", name), partial(arm_to_post, k), solid=0.0)
             for k, name in enumerate(POST_NAMES)
         ),
     ),

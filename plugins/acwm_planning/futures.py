@@ -5,9 +5,10 @@ Only the frames that a cost looks at are decoded, and predicted if the model sav
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from functools import partial
+from typing import cast
 
 import numpy as np
 import torch
@@ -28,7 +29,8 @@ from acwm_core.model.shapes import Actions, Clip, Latent, Video
 from acwm_core.model.stream import continued
 from acwm_core.model.world_model import WorldModel
 from acwm_planning.planner import Cost, Futures, RolloutCost
-from acwm_planning.predicted import predicted_observation
+from acwm_planning.predicted import LazyFields, observation_of
+from acwm_planning.states import CandidateStates, Given
 
 
 @dataclass
@@ -80,8 +82,9 @@ class ModelFutures(Futures):
         last: index, within the last latent frame, of the last planned video frame.
         estimator: reads states from frames, if there is one.
         stills: pictures and their latent frames, encoded before; shared within a decision.
-        states: of the planned video frames, `[N, T, S]`, if the model predicts them.
-        shapes: shapes of their fields.
+        states: predicts the fields of the states in the planned video frames, the one of a name
+            and maybe others, `[N, T, …]` each, if the model can.
+        fields: their names.
         expects: where the model expects things in the planned latent frames, if it sees any.
         reads: where it sees them in latent frames `[1, 1, C, h, w]`.
     """
@@ -96,17 +99,17 @@ class ModelFutures(Futures):
         last: int,
         estimator: StateEstimator | None,
         stills: list[tuple[Frame, Latent]],
-        states: Callable[[], Tensor] | None = None,
-        shapes: Mapping[str, tuple[int, ...]] | None = None,
+        states: Callable[[str], Mapping[str, Tensor]] | None = None,
+        fields: Collection[str] = (),
         expects: Callable[[], Keypoints] | None = None,
         reads: Callable[[Latent], Keypoints] | None = None,
     ) -> None:
         self._codec, self._given, self._past, self._predict = codec, given, past, predict
         self._last, self._estimator, self._stills = last, estimator, stills
         self.length = length
-        self._states, self._shapes = states, shapes or {}
+        self._states, self._fields = states, fields
         self._latents: dict[int, Latent] = {}
-        self._predicted_states: Tensor | None = None
+        self._predicted: Mapping[str, Tensor] = {}
         self._expects, self._reads = expects, reads
         self._keypoints: Keypoints | None = None
 
@@ -114,8 +117,9 @@ class ModelFutures(Futures):
     def finite(self) -> Tensor:
         """Which candidates' predictions are finite, `[N]`, in what was asked for."""
         if not self._latents:
-            if self._predicted_states is not None:
-                return _finite_states(self._predicted_states)
+            if self._predicted:
+                parts = [values.flatten(2) for values in self._predicted.values()]
+                return _finite_states(torch.cat(parts, 2))
             if self._keypoints is not None:
                 return _finite_states(self._keypoints.values.detach().flatten(2))
         self.latents([self.length - 1])
@@ -174,12 +178,19 @@ class ModelFutures(Futures):
         """The states of the last video frame of each latent frame, which are predicted once."""
         if self._states is None:
             return None
-        if self._predicted_states is None:
-            self._predicted_states = self._states()
-        stride = self._codec.temporal_stride
+        stride, candidates = self._codec.temporal_stride, len(self._given)
         video_frames = [frame * stride + self._offset(frame) for frame in frames]
-        states = self._predicted_states[:, video_frames].flatten(0, 1)
-        return predicted_observation(states.cpu(), self._shapes)
+        fields = LazyFields(
+            self._fields, lambda name: self._field(name)[:, video_frames].flatten(0, 1).cpu()
+        )
+        return observation_of(fields, candidates * len(frames))
+
+    def _field(self, name: str) -> Tensor:
+        """A field of the states in the planned video frames, `[N, T, …]`."""
+        assert self._states is not None
+        if name not in self._predicted:
+            self._predicted = self._states(name)
+        return self._predicted[name]
 
     def keypoints(self, frames: Sequence[int]) -> Keypoints | None:
         """They carry a gradient if the actions do, and are predicted once."""
@@ -219,19 +230,6 @@ def _finite_states(states: Tensor) -> Tensor:
     return finite[..., predicted].flatten(1).all(1) & predicted.any()
 
 
-class _Given(NamedTuple):
-    """What a decision knows: the codec with the last given frame, latents and actions up to now."""
-
-    codec: Codec
-    latents: Latent
-    actions: Tensor
-
-    @property
-    def frames(self) -> int:
-        """Number of video frames from the first given one to the current one."""
-        return 1 + self.actions.shape[1]
-
-
 class ModelRollouts:
     """Predicts the futures of candidates with a model.
 
@@ -249,6 +247,8 @@ class ModelRollouts:
             a model with a single context frame how fast things move.
         steps: sampling steps; the model's own number by default.
         batch: number of candidates that are rolled out at once.
+        state_past: as `past`, and instead of it with a model that carries states on: these frames
+            are predicted once for all candidates, and without pictures.
     """
 
     def __init__(
@@ -260,9 +260,15 @@ class ModelRollouts:
         past: int = 0,
         steps: int | None = None,
         batch: int = 128,
+        state_past: int | None = None,
     ) -> None:
         self.world_model, self.card = world_model, card
+        model = world_model.model
+        carries = isinstance(model, Predictor) and model.implements("carry_states")
+        if carries and world_model.state_shapes and state_past is not None:
+            past = state_past
         self._estimator, self._past, self._steps, self._batch = estimator, past, steps, batch
+        self._asked = set[str]()
 
     def cost(
         self, history: History, still: NDArray[np.float32], goal_cost: GoalCost, seed: int
@@ -277,11 +283,15 @@ class ModelRollouts:
         """
         given = self._given(history, still)
         stills: list[tuple[Frame, Latent]] = []
+        states = CandidateStates(
+            *(self.world_model, given, seed, self._asked),
+            lambda actions: self._predict_states(given, actions, seed),
+        )
 
         def cost(actions: Actions) -> Tensor:
             costs: list[Tensor] = []
             for part in actions.split(self._batch):
-                futures = self._futures(given, part, seed, stills)
+                futures = self._futures(given, part, seed, stills, states)
                 # An estimator may read something from a picture that is not finite.
                 readable, finite = goal_cost(futures, len(part)).cpu(), futures.finite.cpu()
                 costs.append(torch.where(finite, readable, torch.nan))
@@ -316,17 +326,18 @@ class ModelRollouts:
         recent = np.array(actions[first:], np.float32).reshape(1, context - 1 + past, len(still))
         return video, torch.from_numpy(recent)
 
-    def _given(self, history: History, still: NDArray[np.float32]) -> _Given:
+    def _given(self, history: History, still: NDArray[np.float32]) -> Given:
         video, recent = self.recent(history, still)
         codec = self.world_model.codec.with_reference(video[:, -1])
-        return _Given(codec, self.world_model.encode(video), recent)
+        return Given(codec, video, self.world_model.encode(video), recent)
 
     def _futures(
         self,
-        given: _Given,
+        given: Given,
         actions: Actions,
         seed: int,
         stills: list[tuple[Frame, Latent]],
+        states: CandidateStates,
     ) -> ModelFutures:
         codec, stride, context = given.codec, given.codec.temporal_stride, given.latents.shape[1]
         past = codec.latent_frames(given.frames) - context
@@ -337,9 +348,6 @@ class ModelRollouts:
             with torch.set_grad_enabled(actions.requires_grad):
                 return self._predict(given, actions, seed, numbers)
 
-        def states() -> Tensor:
-            return self._predict_states(given, actions, seed)[:, past * stride :]
-
         def expected() -> Keypoints:
             with torch.set_grad_enabled(actions.requires_grad):
                 keypoints = self._predict_keypoints(given, actions, seed)
@@ -347,7 +355,7 @@ class ModelRollouts:
 
         latents = given.latents.expand(len(actions), -1, -1, -1, -1)
         world = self.world_model
-        own = states if world.predicts_states else None
+        own = partial(states, actions) if world.predicts_states else None
         expects = expected if world.keypoint_names else None
         futures = ModelFutures(
             codec,
@@ -359,7 +367,7 @@ class ModelRollouts:
             self._estimator,
             stills,
             own,
-            world.state_shapes,
+            world.state_shapes.keys(),
             expects,
             reads_of(world),
         )
@@ -369,7 +377,7 @@ class ModelRollouts:
         return futures
 
     def _predict(
-        self, given: _Given, actions: Actions, seed: int, only: Sequence[int] | None = None
+        self, given: Given, actions: Actions, seed: int, only: Sequence[int] | None = None
     ) -> Latent:
         """All latent frames, including the given ones, `[N, L, C, h, w]`; or only these."""
         world, (begin, length) = self.world_model, self._begun(given, actions, seed)
@@ -378,19 +386,19 @@ class ModelRollouts:
         return world.objective.predict_frames(world.model, begin, length, only, self._steps)
 
     @torch.no_grad()
-    def _predict_states(self, given: _Given, actions: Actions, seed: int) -> Tensor:
+    def _predict_states(self, given: Given, actions: Actions, seed: int) -> Tensor:
         """The states in all video frames after the given ones, `[N, T, S]`."""
         begin, length = self._begun(given, actions, seed)
         model = cast(Predictor, self.world_model.model)
         return model.predict_states(given.latents, begin.conditioning, length, begin.generators)
 
-    def _predict_keypoints(self, given: _Given, actions: Actions, seed: int) -> Keypoints:
+    def _predict_keypoints(self, given: Given, actions: Actions, seed: int) -> Keypoints:
         """In the latent frames after the given ones."""
         begin, length = self._begun(given, actions, seed)
         model = cast(Predictor, self.world_model.model)
         return model.predict_keypoints(given.latents, begin.conditioning, length, begin.generators)
 
-    def _begun(self, given: _Given, actions: Actions, seed: int) -> tuple[Batch, int]:
+    def _begun(self, given: Given, actions: Actions, seed: int) -> tuple[Batch, int]:
         """The beginning of the candidates' clips, and their number of latent frames."""
         world, number, recent = self.world_model, len(actions), given.actions
         rows = torch.cat([recent.expand(number, -1, -1), actions], 1).to(world.action_low.device)

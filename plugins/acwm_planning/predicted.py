@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -58,14 +57,28 @@ class _NoMasks:
     __getattr__ = __getitem__ = __iter__ = __array__ = __eq__ = __hash__ = _refuse
 
 
-def predicted_observation(states: Tensor, shapes: Mapping[str, tuple[int, ...]]) -> Observation:
-    """What is known of T frames from their states `[T, S]`, the fields side by side."""
-    parts = states.split([math.prod(shape) for shape in shapes.values()], 1)
-    fields = {
-        name: np.asarray(part.reshape(-1, *shape))
-        for part, (name, shape) in zip(parts, shapes.items(), strict=True)
-    }
-    return observation_of(fields, len(states))
+class LazyFields(Mapping[str, NDArray[Any]]):
+    """Fields that are predicted when they are asked for, `[T, …]` each.
+
+    Args:
+        names: of the fields.
+        predict: predicts the field of this name.
+    """
+
+    def __init__(self, names: Collection[str], predict: Callable[[str], Tensor]) -> None:
+        self._names, self._predict = names, predict
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return np.asarray(self._predict(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def observation_of(fields: Mapping[str, NDArray[Any]], frames: int) -> Observation:

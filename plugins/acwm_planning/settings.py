@@ -36,6 +36,8 @@ class Settings:
         planner: name and parameters of the planner.
         cost: name and parameters of the cost.
         past: see `ModelRollouts`.
+        state_past: as `past`, for `cost=state` with a model that carries states on; null for
+            `past`.
         steps: see `ModelRollouts`.
         batch: see `ModelRollouts`.
         max_steps: maximum number of actions in an episode; the task's own by default.
@@ -46,13 +48,21 @@ class Settings:
     planner: dict[str, Any]
     cost: dict[str, Any]
     past: int = 0
+    state_past: int | None = None
     steps: int | None = None
     batch: int = 128
     max_steps: int | None = None
     goal_ahead: int | None = None
 
     def __post_init__(self) -> None:
-        minima = {"past": 0, "steps": 1, "batch": 1, "max_steps": 1, "goal_ahead": 1}
+        minima = {
+            "past": 0,
+            "state_past": 0,
+            "steps": 1,
+            "batch": 1,
+            "max_steps": 1,
+            "goal_ahead": 1,
+        }
         for name, minimum in minima.items():
             value = getattr(self, name)
             if value is not None and value < minimum:
@@ -70,7 +80,10 @@ class Settings:
 
     def rollouts(self) -> dict[str, Any]:
         """The parameters of `ModelRollouts`."""
-        return {"past": self.past, "steps": self.steps, "batch": self.batch}
+        reads_states = self.cost["name"] == "state" and self.cost.get("read") != "pictures"
+        state_past = self.state_past if reads_states else None
+        parameters = {"past": self.past, "steps": self.steps, "batch": self.batch}
+        return parameters | {"state_past": state_past}
 
     def rows(self, names: Collection[str]) -> list[str]:
         """The rows to play of those that are asked for, in the order of `ROW_NAMES`.
@@ -88,7 +101,8 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """The settings that affect results, ready for JSON; the batch size does not."""
-        return {name: value for name, value in asdict(self).items() if name != "batch"}
+        unset = {"batch"} | ({"state_past"} if self.state_past is None else set())
+        return {name: value for name, value in asdict(self).items() if name not in unset}
 
 
 def settings_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Generator, Tensor, nn
@@ -147,6 +147,29 @@ class BodyGroup(SteppedGroup):
         change, hidden = self.agent_motion(action, agents, state.agent_change, state.hidden)
         return self.body_motion(state._replace(hidden=hidden), agents + change)
 
+    def move(self, state: Moving, actions: Tensor) -> tuple[Moving, Poses]:
+        """The state one latent frame later; see `Group.move`.
+
+        Bodies that are in none of the scenes cost time and change nothing, so they are left out.
+        """
+        if torch.is_grad_enabled() or actions.is_cuda:  # which would wait for a number
+            return super().move(state, actions)
+        there = state.poses.present.amax(0)[:, 0].nonzero()[:, 0]
+        moved, course = super().move(_of_bodies(state, lambda body: body[:, there]), actions)
+        still = _of_bodies(state, torch.zeros_like)
+        rest = stacked([state.poses] * self.stride)._replace(agents=course.agents)
+        course = rest._replace(
+            places=rest.places.index_copy(2, there, course.places),
+            turns=rest.turns.index_copy(2, there, course.turns),
+        )
+        moved = moved._replace(
+            poses=at_frame(course, -1),
+            place_change=still.place_change.index_copy(1, there, moved.place_change),
+            spin=still.spin.index_copy(1, there, moved.spin),
+            chance=state.chance,
+        )
+        return moved, course
+
     def canvas(self, features: Tensor, past: Poses) -> tuple[Tensor, tuple[Tensor, ...]]:
         """What was where in the given frame; nothing else is remembered."""
         size = features.shape[-2:]
@@ -252,3 +275,14 @@ class BodyGroup(SteppedGroup):
         """Where on the plane the cells of a frame are, `[h w, 2]`, in units."""
         spots = cell_places(size, self.zoom.device)
         return self.zoom * self.view.on_ground(spots, size[1] / size[0])
+
+
+def _of_bodies(state: Moving, function: Callable[[Tensor], Tensor]) -> Moving:
+    """A state with a function applied to what it holds of each body, `[B, N, …]`."""
+    present, places, turns = map(function, state.poses[1:])
+    return state._replace(
+        poses=Poses(state.poses.agents, present, places, turns),
+        place_change=function(state.place_change),
+        spin=function(state.spin),
+        chance=tuple(map(function, state.chance)),
+    )

@@ -81,9 +81,12 @@ class Group(nn.Module, ABC):
     Attributes:
         noise: numbers that a draw of their future depends on; 0 if there is one future.
         is_prepared: whether it knows the scale of its states.
+        agent_size: how many of the values of its states, the first ones, are those of agents that
+            `move_agents` moves; 0 if it cannot.
     """
 
     noise: int = 0
+    agent_size: int = 0
 
     @property
     def is_prepared(self) -> bool:
@@ -149,6 +152,15 @@ class Group(nn.Module, ABC):
         Returns:
             The state in the last video frame, and a course `[B, stride, …]`.
         """
+
+    def move_agents(self, state: Any, actions: Tensor) -> tuple[Any, Tensor]:
+        """As `move`, of the agents alone; for groups with an `agent_size`.
+
+        Returns:
+            The state, in which all else is as it was, and the first values of the states,
+            `[B, stride, agent_size]`.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def canvas(self, features: Tensor, past: Any) -> tuple[Tensor, Any]:

@@ -93,6 +93,7 @@ class NodeGroup(SteppedGroup):
         unit = unit or unit_of(spec.camera, "nodes")
         self.layout = layout = NodeLayout(spec.agents, spec.axes, spec.nodes, every, unit)
         view, light = View(spec.camera, unit), spec.light
+        self.agent_size = spec.agents * spec.axes
         self.sight = NodeSight(latent_channels, layout, view, light, channels)
         self.agent_motion = ValueMotion(spec.agents * spec.axes, 0, width, stride)
         self.node_motion = NodeMotion(layout, MOTION_CHANNELS, noise)
@@ -149,6 +150,15 @@ class NodeGroup(SteppedGroup):
             nodes = unstretched(nodes, self.layout.shape, (1 + self.stretch) * state.spacing)
             change = nodes - form.nodes
         return state._replace(form=Form(agents, nodes), hidden=hidden, change=change)
+
+    def move_agents(self, state: Nodes, actions: Tensor) -> tuple[Nodes, Tensor]:
+        """Agents follow their actions, whatever the nodes do; see `Group.move_agents`."""
+        agents, hidden, passed = state.form.agents, state.hidden, list[Tensor]()
+        for action in actions.unbind(1):
+            agents, hidden = self._followed_by(agents, action, hidden)
+            passed.append(self.layout.unit * agents.flatten(1))
+        moved = state._replace(form=state.form._replace(agents=agents), hidden=hidden)
+        return moved, torch.stack(passed, 1)
 
     def canvas(self, features: Tensor, past: Form) -> tuple[Tensor, Tensor]:
         """What was where in the given frame, and how it shows each node, which is remembered."""

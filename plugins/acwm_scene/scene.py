@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -228,6 +229,34 @@ class SceneDynamics(Predictor):
                     action = group.beside(action[:, None], _vectors(courses))[:, 0]
                 moved[name], courses[name] = group.move(states[name], action)
         return moved, courses
+
+    def agents_of(self, columns: Collection[int]) -> str | None:
+        """The group whose agents alone these columns of the states tell of, if there is one."""
+        for name, _ in self._groups():
+            if columns and {*columns} <= {*self.agent_columns(name).tolist()}:
+                return name
+        return None
+
+    def agent_columns(self, name: str) -> Tensor:
+        """The columns of the states that tell of the agents of a group."""
+        size = dict(self._groups())[name].agent_size
+        return torch.tensor(self.columns[name][:size], dtype=torch.long)
+
+    def move_agents(
+        self, states: dict[str, Any], actions: Mapping[str, Tensor], name: str
+    ) -> tuple[dict[str, Any], Tensor]:
+        """The agents of one group a latent frame later.
+
+        Returns:
+            The states of all groups, in which all else is as it was, and values
+            `[B, stride, S]`, NaN of all else.
+        """
+        group = dict(self._groups())[name]
+        with torch.autocast(actions[name].device.type, enabled=False):
+            moved, values = group.move_agents(states[name], actions[name])
+        whole = values.new_full((*values.shape[:2], self.state_size), math.nan)
+        whole[..., self.agent_columns(name)] = values
+        return {**states, name: moved}, whole
 
     def draw(self, scene: Scene, shown: Mapping[str, Any]) -> Tensor:
         """The latent frame `[B, C, h, w]` of courses `[B, stride, …]`, the last frame first."""
@@ -629,21 +658,33 @@ class _SceneStream(LatentStream):
 class _SceneStates(CarriedStates):
     """The states of scenes, without what drawing them needs."""
 
-    def __init__(self, model: SceneDynamics, states: dict[str, Any]) -> None:
-        self._model, self._states = model, states
+    def __init__(
+        self, model: SceneDynamics, states: dict[str, Any], agents_of: str | None = None
+    ) -> None:
+        self._model, self._states, self._agents_of = model, states, agents_of
 
     @property
     def current(self) -> Tensor:
-        return self._model.states_of(self._states)
+        states = self._model.states_of(self._states)
+        if self._agents_of:
+            known = self._model.agent_columns(self._agents_of)
+            states = torch.full_like(states, math.nan).index_copy(1, known, states[:, known])
+        return states
 
     def advance(self, conditioning: Conditioning) -> Tensor:
         actions = {name: rows[:, -1] for name, rows in self._model.embed(conditioning).items()}
+        if self._agents_of:
+            self._states, states = self._model.move_agents(self._states, actions, self._agents_of)
+            return states
         self._states, courses = self._model.move_states(self._states, actions)
         return self._model.decode(courses)
 
     def picked(self, rows: Tensor) -> CarriedStates:
         copied = tree_map(lambda values: values[rows.to(values.device)].clone(), self._states)
-        return _SceneStates(self._model, copied)
+        return _SceneStates(self._model, copied, self._agents_of)
+
+    def only(self, columns: Collection[int]) -> CarriedStates:
+        return _SceneStates(self._model, self._states, self._model.agents_of(columns))
 
     def put(self, rows: Tensor, others: CarriedStates) -> None:
         assert isinstance(others, _SceneStates)

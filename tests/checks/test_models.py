@@ -456,3 +456,13 @@ class NeverBeginsAnew(Scene):
 
     def carry_states(self, given, generators=()):
         return self.Kept(super().carry_states(given, generators))
+
+
+@FLAWS.caught_by("carries the states that it predicts", "for who needs the first value alone")
+class LeavesOutTheFirst(Scene):
+    class Kept(Carried):
+        def only(self, columns):
+            return Shifts.Kept(self._states)
+
+    def carry_states(self, given, generators=()):
+        return self.Kept(super().carry_states(given, generators))

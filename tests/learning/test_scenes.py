@@ -36,7 +36,7 @@ def rows(steps, number, seed=0):
 
 def arms(stride):
     """A scene whose layers have random weights, as a world model."""
-    model = model_of_arms(temporal_stride=stride, latent_channels=768).eval()
+    model = model_of_arms(temporal_stride=stride, latent_channels=192 * stride).eval()
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     return world_of(model, stride, states=4).eval()
@@ -59,6 +59,16 @@ def test_carried_states_are_the_predicted_ones():
     torch.testing.assert_close(stream.current["all"][1:2], first)
     later = [stream.step(actions[[0, 2, 1], k : k + 4])["all"] for k in range(0, 16, 4)]
     torch.testing.assert_close(torch.cat(later, 1)[1], whole[2], atol=1e-5, rtol=1e-5)
+
+
+def test_a_stream_of_some_fields_tells_them():
+    world = arms(4)
+    stream = world.stream_states(torch.rand(2, 3, 32, 32))
+    actions = torch.rand(2, 4, 2) - 0.5
+    some = stream.only(["all"]).picked(torch.arange(2))
+    torch.testing.assert_close(some.step(actions)["all"], stream.step(actions)["all"])
+    with pytest.raises(KeyError, match="velocity"):
+        stream.only(["velocity"])
 
 
 def test_a_model_that_carries_no_states_says_so(tmp_path):

@@ -3,7 +3,6 @@
 import math
 import re
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -22,11 +21,9 @@ from acwm_planning.costs import (
     last_frames,
 )
 from acwm_planning.planner import Cost, Futures
-from acwm_planning.predicted import predicted_observation
+from acwm_planning.predicted import observation_of
 from tests import tiny
 from tests.planning.problems import planned, quadratic
-
-SHAPES = {"position": (2,)}
 
 
 class Known(Futures):
@@ -95,17 +92,21 @@ def test_frames_with_an_unknown_distance_are_penalised(unknown):
     torch.testing.assert_close(nothing, torch.full((3,), unknown))
 
 
+def fields_of(values, name):
+    return observation_of({name: np.asarray(values)}, len(values))
+
+
 class Predicted(Known):
     """Of a model that says that all is at (14, 14), whatever the pictures show."""
 
-    shapes = SHAPES
+    name = "position"
 
     def predicted(self, frames):
-        return predicted_observation(torch.full((3 * len(frames), 2), 14.0), self.shapes)
+        return fields_of(torch.full((3 * len(frames), 2), 14.0), self.name)
 
 
 class Elsewhere(Predicted):
-    shapes: ClassVar = {"speed": (2,)}
+    name = "speed"
 
 
 @pytest.mark.parametrize("read", ["pictures", "model", None])
@@ -132,7 +133,7 @@ class Half(Predicted):
     def predicted(self, frames):
         states = torch.full((3 * len(frames), 2), 14.0)
         states[:, 1] = torch.nan
-        return predicted_observation(states, self.shapes)
+        return fields_of(states, self.name)
 
 
 def test_what_a_model_predicts_in_part_is_read_from_pictures():
@@ -146,7 +147,7 @@ def test_what_a_model_predicts_in_part_is_read_from_pictures():
 @pytest.mark.parametrize("look", [lambda m: m == 1, lambda m: m[0], lambda m: np.asarray(m).sum()])
 def test_a_model_that_predicts_states_predicts_no_masks(look):
     """A task that looks at masks gets those of pictures, and no empty ones."""
-    seen = predicted_observation(torch.zeros(3, 2), SHAPES)
+    seen = fields_of(torch.zeros(3, 2), "position")
     assert len(seen.masks) == 3
     with pytest.raises(RecipeError, match="the task needs masks"):
         look(seen.masks)

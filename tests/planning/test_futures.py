@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.model.state_stream import StateStream
 from acwm_core.training.run import load_run
 from acwm_planning.futures import GoalCost, History, ModelFutures, ModelRollouts
+from acwm_planning.settings import settings_of
 from tests import tiny
+from tests.learning.test_scenes import arms
 
 STILL = np.zeros(2, np.float32)
 
@@ -233,12 +236,62 @@ def test_states_that_are_not_finite_are_no_prediction(bundle, diverged):
     states[..., 1] = torch.nan
     states[diverged, 2:] = torch.nan
     given = torch.zeros(3, 1, 16, 4, 4)
-    codec, shapes = bundle.world_model.codec, {"known": (1,), "unknown": (1,)}
+    codec = bundle.world_model.codec
     if len(diverged) == 3:
         states[:] = torch.nan
-    futures = ModelFutures(codec, given, 0, 2, None, 1, None, [], lambda: states, shapes)
-    futures.predicted([0])
+    fields = {"known": states[..., :1], "unknown": states[..., 1:]}
+    futures = ModelFutures(codec, given, 0, 2, None, 1, None, [], lambda name: fields, fields)
+    assert futures.predicted([0]).states["known"].shape == (3, 1)
     assert futures.finite.tolist() == [clip not in diverged for clip in range(3)]
+
+
+def test_only_a_model_that_carries_states_starts_as_far_back_as_these_may(history, bundle):
+    """And only for a cost of predicted states."""
+    state = settings_of(["cost=state", "past=1", "state_past=2"]).rollouts()
+    for settings, world, taken in (
+        (state, arms(2), 4),
+        (state, bundle.world_model, 2),
+        (settings_of(["cost=latent", "past=1", "state_past=2"]).rollouts(), arms(2), 2),
+        (settings_of(["cost=state", "past=1"]).rollouts(), arms(2), 2),
+    ):
+        given = ModelRollouts(world, bundle.card, None, **settings)._given(history, STILL)
+        assert given.actions.shape[1] == taken
+
+
+@pytest.mark.parametrize("past", [0, 1, 2])
+def test_states_of_candidates_are_those_that_the_model_predicts(history, bundle, past, monkeypatch):
+    """The past is predicted once for all of them, and a field when a cost asks for it."""
+    world, advanced = arms(2), []
+    history.actions[:] = [action / 4 for action in history.actions]
+    rollouts, actions = ModelRollouts(world, bundle.card, None, past=past), candidates(3, 5) / 4
+    taken = (
+        torch.from_numpy(np.stack(history.actions))[-2 * past :][None] if past else actions[:, :0]
+    )
+    rows = torch.cat([taken.expand(3, -1, -1), actions, actions[:, -1:]], 1)
+    rows = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+    given = frame_of(history.frames[-1 - 2 * past]).expand(3, -1, -1, -1)
+    whole = world.predict_states(given, rows)["all"][:, 2 * past :]
+    step = StateStream.step
+    monkeypatch.setattr(
+        StateStream, "step", lambda self, rows: advanced.append(len(rows)) or step(self, rows)
+    )
+
+    def judge(futures, task, goal):
+        seen = futures.predicted([0, 2])
+        before = len(advanced)
+        torch.testing.assert_close(
+            torch.from_numpy(seen.states["all"]),
+            whole[:, [1, 4]].flatten(0, 1),
+            rtol=1e-4,
+            atol=1e-4,
+        )
+        np.asarray(futures.predicted([1]).states["all"])
+        assert len(advanced) - before == past * (not before) + 3
+        return torch.zeros(3)
+
+    cost = rollouts.cost(history, STILL, GoalCost(judge, None, None), 0)
+    assert cost(actions).equal(cost(actions))
+    assert advanced == [1] * past + [3] * 6
 
 
 def test_longer_plans_than_the_model_knows_are_refused(bundle, history):

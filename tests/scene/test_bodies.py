@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from acwm_core.checks import check_model
 from acwm_scene.bodies import BodyGroup
-from acwm_scene.body_motion import HIDDEN, BodyMotion, Moving
+from acwm_scene.body_motion import ACTION, HIDDEN, BodyMotion, Moving
 from acwm_scene.body_windows import HORIZONS, moving_windows
 from acwm_scene.declared import GroupSpec
 from acwm_scene.group import at_frame
@@ -43,6 +43,38 @@ def test_poses_are_states_as_they_were_recorded():
     assert decoded[0, 0, [6, 9]].isnan().all()
     states[0, 0, [6, 9]], states[0, 0, 11] = math.nan, 2.0 - math.pi / 2
     torch.testing.assert_close(decoded, states, equal_nan=True)
+
+
+@pytest.mark.parametrize("there", [[[0, 0]], [[0, 1]], [[1, 0], [0, 0]], [[1, 0], [0, 1]]])
+@pytest.mark.parametrize("noise", [0, 3])
+def test_bodies_that_are_in_no_scene_are_left_out_and_stay_as_they_were(there, noise, monkeypatch):
+    torch.manual_seed(0)
+    group = next(model_of_pucks(noise=noise).groups.children()).eval()
+    for parameter in group.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    scenes = len(there)
+    turns = torch.nn.functional.normalize(torch.randn(scenes, 2, 2), dim=-1)
+    poses = Poses(torch.randn(scenes, 1, 2), torch.tensor(there)[..., None].float(), *[turns] * 2)
+    change = torch.randn(scenes, 2, 2) * poses.present
+    state = group._begun(poses, torch.zeros(scenes, 1, 2), change, 0 * change[..., :1])
+    if noise:
+        state = group.with_draw(state, torch.randn(scenes, 2 * noise))
+    actions, moved = torch.randn(scenes, 1, 1, ACTION), []
+    monkeypatch.setattr(
+        group.body_motion,
+        "forward",
+        lambda moving, agents, motion=group.body_motion.forward: (
+            moved.append(moving.poses.places.shape[1]) or motion(moving, agents)
+        ),
+    )
+    for _ in range(2):
+        whole = group.move(state, actions)
+        with torch.no_grad():
+            less = group.move(state, actions)
+        torch.testing.assert_close(less, whole)
+        state = less[0]
+    some = [*map(any, zip(*there, strict=True))]
+    assert moved == [2, sum(some)] * 2
 
 
 def test_a_body_moves_alike_in_any_frame_and_feels_none_that_is_not_there():

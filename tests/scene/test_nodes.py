@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from acwm_core.model.conditioner import Conditioning
 from acwm_scene.agent_sight import AgentSight, cell_places
 from acwm_scene.group import at_frame
 from acwm_scene.node_motion import NodeMotion
 from acwm_scene.node_sight import HIDDEN, NodeSight, form_loss
 from acwm_scene.node_windows import node_windows
-from acwm_scene.nodes import Form, NodeLayout, View, evenly, spacing, unstretched
+from acwm_scene.nodes import Form, NodeBlock, NodeLayout, View, evenly, spacing, unstretched
 from tests.scene.mechanics import CAMERA, NODES, model_of_ropes, ropes
 
 
@@ -30,6 +31,37 @@ def test_forms_are_states_as_they_were_recorded(every):
     states = torch.cat([torch.arange(6.0), nodes])[None, None] * 0.3
     layout = NodeLayout(2, 3, [7, 5], every, 0.1)
     torch.testing.assert_close(layout.states(layout.form(states)), states)
+
+
+def test_agents_alone_move_as_they_do_with_the_nodes(monkeypatch):
+    """For who needs no more, without the work that the nodes are."""
+    torch.manual_seed(0)
+    model = model_of_ropes().eval()
+    clips = Conditioning(torch.randn(3, 6, model.width), None, None)
+    given = torch.randn(3, 1, 2, 8, 8)
+    steps = [clips.frames(frame - 1, frame + 1) for frame in range(1, 6)]
+    with torch.no_grad():
+        whole = model.predict_states(given, clips, 6)
+        begun = model.carry_states(given)
+        some = begun.only([1, 7])
+        both = torch.cat([some.advance(step) for step in steps], 1)
+        torch.testing.assert_close(both, whole)
+        monkeypatch.setattr(NodeMotion, "forward", lambda *_: pytest.fail("nodes are moved"))
+        alone = begun.only([1]).picked(torch.arange(3))
+        passed = torch.cat([alone.advance(step) for step in steps], 1)
+    torch.testing.assert_close(passed[..., :2], whole[..., :2])
+    torch.testing.assert_close(alone.current, passed[:, -1], equal_nan=True)
+    assert passed[..., 2:].isnan().all()
+
+
+@pytest.mark.parametrize("reach", [1, 4, 8, 20])
+def test_nodes_hear_the_same_with_and_without_a_gradient(reach):
+    """Along a rope, where planning takes another way to compute it; also from beyond its ends."""
+    torch.manual_seed(0)
+    block, features = NodeBlock(1, 8, reach), torch.randn(2, 9, 8)
+    with torch.no_grad():
+        alone = block(features, (9,))
+    torch.testing.assert_close(alone, block(features, (9,)).detach())
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1.75])
