@@ -25,6 +25,10 @@ LARGE = replace(TAKES, size=(96, 128))
 """As a camera takes them: larger than a small model's frames."""
 
 
+ELSEWHERE = ("data import rlds", "data import videos films", "data label")
+"""Commands on data that only their own tests have."""
+
+
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
     """A folder with what the page speaks of."""
@@ -52,6 +56,7 @@ def desk(tmp_path, monkeypatch):
 def test_every_step_works(desk):
     text = "".join(page.read_text() for page in PAGES)
     commands = re.findall(r"^ {4}acwm (.*)$", text, re.M)
+    commands = [command for command in commands if not command.startswith(ELSEWHERE)]
     assert len(commands) == 17
     for line in commands:
         words = shlex.split(line)
@@ -64,6 +69,7 @@ def test_every_step_works(desk):
         exec(compile(code, "walk", "exec"), {"__name__": "walk"})
     made = {path.parent.name for path in Path("data").rglob("card.yaml")}
     shown = set(re.findall(r"--out data/(\w+)", text))
-    assert made == {*shown, "arm", "cubes", "reacher"} - {"published"}
+    elsewhere = {"published", "bridge", "films", "labelled"}
+    assert made == {*shown, "arm", "cubes", "reacher"} - elsewhere
     assert DatasetCard.read("data/arm").splits == {"train": 2, "ind_test": 2}
     assert Path("runs/small/report.html").is_file()
