@@ -62,7 +62,7 @@ def learnt():
     latents, _, actions = balls(256, seed=1)
     learn_points(model, clips := clips_of(latents), 110)
     world = world_of(model, stride=1, states=4)
-    learn_motion(world, states_with_points(model, clips), actions, steps=240, clips=32)
+    learn_motion(world, states_with_points(model, clips), actions, steps=400, clips=32)
     return world
 
 
@@ -164,7 +164,7 @@ def test_points_move_with_regard_to_what_is_declared():
     place[..., 0] = 0.5 * (values - values[:, :1])[..., 0]
     model.points.measure(place.flatten(0, 1)[:, None], torch.ones(1, 6))
     world, states = world_of(model, stride=1, states=7), torch.cat([values, place], 2)
-    learn_motion(world, states, torch.zeros(128, FRAMES, 2), steps=240, clips=32)
+    learn_motion(world, states, torch.zeros(128, FRAMES, 2), steps=400, clips=32)
     actions = model.points.embed(torch.zeros(128, FRAMES, SMALL["width"]))
     beside = model.points.beside(actions, model.encode(states)["values"][:, 1:])
     state = model.points.begin(place[:, :1], place[:, :1])
