@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from acwm_core.env.environment import ActionSpec, Environment, Policy
 from acwm_core.env.task import Goal, Task
-from acwm_core.errors import PluginError, check_shape
+from acwm_core.errors import PluginError, RecipeError, check_shape
 from acwm_planning.futures import GoalCost, History, ModelRollouts
 from acwm_planning.planner import Cost, Plan, Planner, RolloutCost
 from acwm_planning.prior import PolicyPrior
@@ -149,10 +149,7 @@ class PlanningController(Controller):
             None if action_std is None else torch.tensor(action_std, dtype=torch.float32)
         )
         self.decisions: list[Decision] = []
-        prior = planner.prior if isinstance(planner, SearchPlanner) else None
-        self._prior: PolicyPrior | None = None
-        if prior is not None and isinstance(rollouts, ModelRollouts):
-            self._prior = PolicyPrior(prior, rollouts)
+        self._prior = _prior_of(planner, rollouts)
 
     def begin(self, environment: Environment, task: Task, goal: Goal) -> None:
         rng = environment.episode_spec.rng("planner")
@@ -225,3 +222,19 @@ class PlanningController(Controller):
         check_shape(self._planner, "plan", actions, -1, len(self._low))
         check_bounds(self._planner, "plan", actions, self._low.numpy(), self._high.numpy())
         return actions
+
+
+def _prior_of(planner: Planner, rollouts: Rollouts) -> PolicyPrior | None:
+    """The policy whose actions the search starts from, if the planner names one.
+
+    Raises:
+        RecipeError: nothing predicts the states that the policy acts on.
+    """
+    if not isinstance(planner, SearchPlanner) or planner.prior is None:
+        return None
+    if not isinstance(rollouts, ModelRollouts):
+        raise RecipeError(
+            "planner.prior acts on the states that a model predicts, so the rows simulator and "
+            "codec, and acwm play, cannot use it: leave it out there"
+        )
+    return PolicyPrior(planner.prior, rollouts)

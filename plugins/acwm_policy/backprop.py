@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from acwm_core.errors import RecipeError
+from acwm_core.errors import RecipeError, TrainingError
 from acwm_policy.episodes import Step
 from acwm_policy.learner import Learner, Report
 from acwm_policy.lesson import Lesson
@@ -125,10 +125,11 @@ class Backprop(Learner):
         self._climbing.zero_grad()
         (-total / (self._horizon * self._episodes.number)).backward()
         own = [*self._actor.parameters(), self._deviations]
-        for parameter in own:  # where a model's gradient is unknown, nothing is learnt
-            if parameter.grad is not None:
-                parameter.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
-        nn.utils.clip_grad_norm_(own, self._clip)
+        if not nn.utils.clip_grad_norm_(own, self._clip).isfinite():
+            raise TrainingError(
+                f"the gradient through the dream is not finite after {self.steps} steps: take a "
+                "smaller learning_rate or horizon, or another algorithm"
+            )
         self._climbing.step()
         return vectors, passed
 

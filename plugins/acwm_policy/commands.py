@@ -43,8 +43,8 @@ def policy() -> None:
 @click.option(
     "--steps",
     type=click.IntRange(1),
-    help="Steps of all scenes together, by default 200,000; an action is held for a step, which is "
-    "a latent frame.",
+    help="Steps of all scenes together, or moments of recordings; by default as many as the "
+    "algorithm declares. An action is held for a step, which is a latent frame.",
 )
 @click.option(
     "--scenes",

@@ -48,9 +48,9 @@ def flattened(course: Tree) -> Tree:
     return tree_map(lambda values: values.flatten(0, 1), course)
 
 
-def as_vectors(course: Any) -> Tensor:
-    """A course as one vector for each frame, `[B, T, V]`."""
-    leaves = cast(list[Tensor], cast(Any, _pytree).tree_leaves(course))
+def as_vectors(courses: Any) -> Tensor:
+    """A course, or several, as one vector for each frame, `[B, T, V]`."""
+    leaves = cast(list[Tensor], cast(Any, _pytree).tree_leaves(courses))
     return torch.cat([values.flatten(2).float() for values in leaves], 2)
 
 

@@ -83,7 +83,7 @@ class PointMotion(nn.Module):
         self.register_buffer("std", torch.ones(points, entries))
         self.actions = nn.Linear(width, ACTION)
         self.chance = nn.Linear(noise, ACTION, bias=False) if noise else None
-        self.beside = (
+        self.declared = (
             nn.Sequential(nn.Linear(declared, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, ACTION))
             if declared
             else None

@@ -131,20 +131,25 @@ class PointGroup(Group):
         """Embedded actions by latent frames; see `PointMotion.embed`."""
         return self.motion.embed(modulation)
 
-    def beside(self, actions: Tensor, declared: Tensor) -> Tensor:
+    def with_declared(
+        self, actions: Tensor, declared: Tensor, random: Generator | None = None
+    ) -> Tensor:
         """Embedded actions that also tell what declared things do meanwhile.
 
         Args:
             actions: by latent frames, `[B, L, ACTION]`.
             declared: the course of declared things in the video frames of the last of these latent
                 frames, `[B, stride · N, V]`; as in a clip, whose first frame nothing leads to.
+            random: of noise on the course, in training.
 
         Returns:
             `[B, L, ACTION]`.
         """
-        assert self.motion.beside is not None
-        vectors = declared.unflatten(1, (-1, self.stride)).flatten(2)
-        embedded = self.motion.beside(vectors)
+        assert self.motion.declared is not None
+        if random is not None:
+            noise = to_device(torch.randn(declared.shape, generator=random), declared)
+            declared = declared + DECLARED_NOISE * noise
+        embedded = self.motion.declared(declared.unflatten(1, (-1, self.stride)).flatten(2))
         return actions + functional.pad(embedded, (0, 0, actions.shape[1] - embedded.shape[1], 0))
 
     def move(self, state: Points, actions: Tensor) -> tuple[Points, Tensor]:

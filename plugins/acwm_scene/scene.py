@@ -24,6 +24,7 @@ from acwm_core.model.dynamics import (
 )
 from acwm_core.model.shapes import Latent
 from acwm_scene.bodies import BodyGroup
+from acwm_scene.carried import SceneStates, SceneStream
 from acwm_scene.declared import GroupSpec, default_states, groups_of
 from acwm_scene.group import (
     Group,
@@ -36,7 +37,7 @@ from acwm_scene.group import (
 )
 from acwm_scene.layers import FrameDrawing, MatrixConv
 from acwm_scene.node_group import NodeGroup
-from acwm_scene.points import DECLARED_NOISE, PointGroup
+from acwm_scene.points import PointGroup
 from acwm_scene.upgrade import upgraded
 from acwm_scene.values import ValueGroup
 
@@ -141,11 +142,12 @@ class SceneDynamics(Predictor):
         groups = {name: GROUPS[spec.kind](spec, **sizes, **options) for name, spec in specs.items()}
         self.point_size = 0
         if points:
-            recorded = {name: torch.zeros(1, 1, len(spec.columns)) for name, spec in specs.items()}
-            seen = sum(
-                as_vectors(groups[name].encode(zeros)).shape[2] for name, zeros in recorded.items()
-            )
-            groups["points"] = group = PointGroup(points, declared=seen, **sizes)
+            declared = {
+                name: groups[name].encode(torch.zeros(1, 1, len(spec.columns)))
+                for name, spec in specs.items()
+            }
+            size = as_vectors(declared).shape[2] if declared else 0
+            groups["points"] = group = PointGroup(points, declared=size, **sizes)
             self.point_size = group.size
             self.columns["points"] = [*range(state_size, state_size + group.size)]
         self.groups = nn.Module()  # a ModuleDict has an attribute `values` of its own
@@ -226,7 +228,7 @@ class SceneDynamics(Predictor):
             for name, group in self._groups():
                 action = actions[name]
                 if isinstance(group, PointGroup) and courses:
-                    action = group.beside(action[:, None], _vectors(courses))[:, 0]
+                    action = group.with_declared(action[:, None], as_vectors(courses))[:, 0]
                 moved[name], courses[name] = group.move(states[name], action)
         return moved, courses
 
@@ -343,13 +345,13 @@ class SceneDynamics(Predictor):
         """
         self._check_states()
         scene = self._with_draw(self.read(given), self._drawn(given, generators))
-        return _SceneStates(self, scene.states)
+        return SceneStates(self, scene.states)
 
     def stream(
         self, given: Latent, *, context: int, generators: Sequence[Generator] = ()
     ) -> LatentStream:
         """Stream from the scene. `context` is ignored, as the scene holds all that is known."""
-        return _SceneStream(self, self._with_draw(self.read(given), self._drawn(given, generators)))
+        return SceneStream(self, self._with_draw(self.read(given), self._drawn(given, generators)))
 
     def matrices(self) -> list[nn.Parameter]:
         """The weights of the convolutions in the blocks and in the head that draw."""
@@ -495,10 +497,8 @@ class SceneDynamics(Predictor):
         actions, declared = self.embed(conditioning), self.encode(states)
         declared.pop("points", None)
         if self.points and declared:
-            later = _vectors(declared)[:, 1:]
-            noise = to_device(torch.randn(later.shape, generator=random), later)
-            later = later + DECLARED_NOISE * noise
-            actions["points"] = self.points.beside(actions["points"], later)
+            later = as_vectors(declared)[:, 1:]
+            actions["points"] = self.points.with_declared(actions["points"], later, random)
         losses = [
             group.motion_loss(
                 states[..., self.columns[name]].float(), actions[name], random, progress
@@ -636,60 +636,3 @@ class SceneDynamics(Predictor):
             for (name, group), part in zip(self._groups(), parts, strict=True)
         }
         return scene._replace(states=states)
-
-
-def _vectors(courses: Mapping[str, Any]) -> Tensor:
-    """The courses of several groups as vectors `[B, T, V]`."""
-    return torch.cat([as_vectors(course) for course in courses.values()], 2)
-
-
-class _SceneStream(LatentStream):
-    """A stream that carries the scene."""
-
-    def __init__(self, model: SceneDynamics, scene: Scene) -> None:
-        self._model, self._scene = model, scene
-
-    def advance(self, conditioning: Conditioning) -> Latent:
-        """The next latent frame; see `LatentStream.advance`."""
-        latent, self._scene = self._model.next_frame(self._scene, conditioning)
-        return latent
-
-
-class _SceneStates(CarriedStates):
-    """The states of scenes, without what drawing them needs."""
-
-    def __init__(
-        self, model: SceneDynamics, states: dict[str, Any], agents_of: str | None = None
-    ) -> None:
-        self._model, self._states, self._agents_of = model, states, agents_of
-
-    @property
-    def current(self) -> Tensor:
-        states = self._model.states_of(self._states)
-        if self._agents_of:
-            known = self._model.agent_columns(self._agents_of)
-            states = torch.full_like(states, math.nan).index_copy(1, known, states[:, known])
-        return states
-
-    def advance(self, conditioning: Conditioning) -> Tensor:
-        actions = {name: rows[:, -1] for name, rows in self._model.embed(conditioning).items()}
-        if self._agents_of:
-            self._states, states = self._model.move_agents(self._states, actions, self._agents_of)
-            return states
-        self._states, courses = self._model.move_states(self._states, actions)
-        return self._model.decode(courses)
-
-    def picked(self, rows: Tensor) -> CarriedStates:
-        copied = tree_map(lambda values: values[rows.to(values.device)].clone(), self._states)
-        return _SceneStates(self._model, copied, self._agents_of)
-
-    def only(self, columns: Collection[int]) -> CarriedStates:
-        return _SceneStates(self._model, self._states, self._model.agents_of(columns))
-
-    def put(self, rows: Tensor, others: CarriedStates) -> None:
-        assert isinstance(others, _SceneStates)
-        self._states = tree_map(
-            lambda own, new: own.index_copy(0, rows.to(own.device), new.to(own)),
-            self._states,
-            others._states,
-        )

@@ -83,7 +83,7 @@ def rms(summary, split, row):
     return math.sqrt(summary.splits[split].scores.rows[row]["mse"].value)
 
 
-@pytest.mark.parametrize("kind", ["mp4", pytest.param("webm", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["mp4", pytest.param("webm", marks=pytest.mark.ci)])
 @pytest.mark.ci
 def test_lossy_video_differs_by_less_than_what_is_told(kind, run, tasks, truth, scored, tmp_path):
     predictions = predict(run, tasks, tmp_path / kind, kind)

@@ -14,6 +14,7 @@ from acwm_planning.episode import spec_of_seed, start_of
 from acwm_planning.futures import ModelRollouts
 from acwm_planning.policies.saved import SavedPolicy
 from acwm_planning.sampling import CrossEntropy, RandomShooting
+from acwm_planning.simulator import SimulatorRollouts
 from tests import tiny
 from tests.learning.world import straight
 
@@ -72,3 +73,10 @@ def test_a_policy_of_another_task_or_rate_is_refused(stage, tmp_path):
     SavedPolicy(replace(whole.card, task="shy"), whole._network).save(tmp_path)
     with pytest.raises(RecipeError, match=r"trained for slide\.shy, not for slide\.place"):
         decided(stage, RandomShooting(candidates=1, prior=str(tmp_path)))
+
+
+def test_rollouts_of_a_simulator_have_no_place_for_a_policy(stage):
+    """Silently without it, the row would be no upper bound of the others."""
+    planner = RandomShooting(candidates=1, prior=str(stage[1]))
+    with pytest.raises(RecipeError, match=r"planner\.prior"):
+        PlanningController(planner, SimulatorRollouts.__new__(SimulatorRollouts), StateDistance())

@@ -118,11 +118,11 @@ def test_it_draws_what_cannot_be_known(monkeypatch):
 
     def clips(number, seed):
         reach = reaches.uniform(0.5, 1.5, (number, 2, 1))
-        return pucks(number, seed, frames=9, reach=reach)
+        return pucks(number, seed, reach=reach)
 
-    model = model_of_pucks(noise=2)
+    model = model_of_pucks(channels=48, noise=2)
     world = world_of(model, stride=1, states=10)
-    learn_motion(world, *clips(256, 0), steps=100, until=0.3, rate=1e-2)
+    learn_motion(world, *clips(256, 0))
     truths = [model.encode(clips(32, 1)[0])["bodies"] for _ in range(16)]
     (group,), random = model.groups.children(), torch.Generator().manual_seed(0)
     start, path = at_frame(truths[0], 0), truths[0].agents[:, 1:]
@@ -136,9 +136,9 @@ def test_it_draws_what_cannot_be_known(monkeypatch):
         draws = torch.stack([drawn() for _ in truths])
     true = torch.stack([each.places[:, -1] for each in truths])
     doubt, spread = (each.var(0).sum(-1).sqrt() for each in (true, draws))
-    assert doubt.mean() > 0.1
-    assert 0.5 < spread[doubt > 0.1].mean() / doubt[doubt > 0.1].mean() < 2
-    assert spread[doubt < 0.01].mean() < 0.7 * spread[doubt > 0.1].mean()
+    assert doubt.mean() > 0.2
+    assert 0.7 < spread[doubt > 0.1].mean() / doubt[doubt > 0.1].mean() < 1.4
+    assert spread[doubt < 0.01].mean() < 0.3 * spread[doubt > 0.1].mean()
     one, mean = ((each - true).norm(dim=-1).mean() for each in (draws, draws.mean(0)))
     assert mean < one
 

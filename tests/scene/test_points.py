@@ -166,7 +166,7 @@ def test_points_move_with_regard_to_what_is_declared():
     world, states = world_of(model, stride=1, states=7), torch.cat([values, place], 2)
     learn_motion(world, states, torch.zeros(128, FRAMES, 2), steps=400, clips=32)
     actions = model.points.embed(torch.zeros(128, FRAMES, SMALL["width"]))
-    beside = model.points.beside(actions, model.encode(states)["values"][:, 1:])
+    beside = model.points.with_declared(actions, model.encode(states)["values"][:, 1:])
     state = model.points.begin(place[:, :1], place[:, :1])
     for frame in range(1, FRAMES):
         state, _ = model.points.move(state, beside[:, frame])

@@ -80,9 +80,10 @@ def test_what_moves_by_rounding_alone_is_not_magnified(data, monkeypatch):
     assert std[0] > 2
 
 
+@pytest.mark.parametrize("steps", [0, 3])
 @pytest.mark.ci
-def test_a_killed_run_resumes_with_the_same_states(data, tmp_path, monkeypatch):
-    asked = learner(3)
+def test_a_killed_run_resumes_with_the_same_states(steps, data, tmp_path, monkeypatch):
+    asked = learner(steps)
     whole = RunFolder(fit(killable(data, **asked), tmp_path / "whole"))
     monkeypatch.setattr(Kill, "batch", 7)
     run = killed_run(data, tmp_path / "run", monkeypatch, **asked)
@@ -152,9 +153,9 @@ def test_the_motion_is_learnt_first_and_then_kept(data, tmp_path):
         conditioning = world.condition(held["actions"], 5)
         return world.model.motion_loss(held["states"], conditioning, random, progress=1).item()
 
-    before, after = trained("before", 1), trained("after", 200)
-    assert error(after) < 0.5 * error(before)
-    longer = trained("longer", 200, pictures=5)
+    before, after = trained("before", 1), trained("after", 300)
+    assert error(after) < 0.1 * error(before)
+    longer = trained("longer", 300, pictures=5)
     assert weights(after).keys() == weights(longer).keys() != set()
     for name, value in weights(after).items():
         torch.testing.assert_close(value, weights(longer)[name], rtol=0, atol=0)

@@ -62,9 +62,9 @@ def few(line, learns_motion):
 
 
 @pytest.mark.ci
-def test_every_printed_command_runs(tmp_path, monkeypatch):
-    """On little data, in few steps; of a model that draws."""
-    name = "push_cube_draws"
+@pytest.mark.parametrize("name", ["push_cube_draws", "reacher"])
+def test_every_printed_command_runs(name, tmp_path, monkeypatch):
+    """On little data, in few steps; of bodies with draws, and of values."""
     monkeypatch.chdir(tmp_path)
     lines = printed(name)
     recipe = RunFolder(folder(name)).recipe.read_text("utf-8")
