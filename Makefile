@@ -9,6 +9,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TEST_PROCESSES ?= $(shell expr $$(nproc 2>/dev/null || sysctl -n hw.ncpu) + 1)
 # Each process would otherwise rewrite the assertions of all tests anew, where a shell forbids bytecode.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
+DIST := dist
 SELECT ?= not slow and not gpu and not browser and not ci
 
 .DEFAULT_GOAL := help
@@ -50,8 +51,10 @@ docs: $(VENV)/installed-all  ## Draw the pictures of docs/reference/environments
 site: $(VENV)/installed-all  ## Build the site of the documents in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
-build: $(VENV)/installed-all  ## Build the wheel and the source distribution in dist/
-	$(BIN)/python -m build
+build: $(VENV)/installed-all  ## Build the wheel, that of the models and the source distribution in dist/
+	$(BIN)/python -m build --outdir $(DIST)
+	$(BIN)/python -m build --wheel --outdir $(DIST) plugins/acwm_zoo/models
+	$(BIN)/twine check --strict $(DIST)/*
 
 clean:  ## Remove what the other targets made, but neither data/ nor runs/
 	rm -rf $(VENV) dist build site .pytest_cache .ruff_cache .import_linter_cache

@@ -1,14 +1,22 @@
 """Registers the models in `models/`, the Hub, and the commands that make and publish models."""
 
 from acwm_core.plugins import Registry, hookimpl
-from acwm_zoo.shipped import about, shipped
+from acwm_zoo.shipped import INSTALL, about, known, shipped
 
 
 @hookimpl
 def register_trained_models(registry: Registry) -> None:
     """Add the models of this package by folder name, and those of the Hub."""
-    for name in shipped():
-        registry.add(name, "acwm_zoo.shipped:folder", summary=about(name), model=name)
+    installed = shipped()
+    for name in known():
+        registry.add(
+            name,
+            "acwm_zoo.shipped:folder",
+            summary=about(name),
+            requires=() if name in installed else ("acwm_models",),
+            install=INSTALL,
+            model=name,
+        )
     registry.add(
         "hf",
         "acwm_zoo.hub:fetch",

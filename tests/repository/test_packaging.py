@@ -7,6 +7,7 @@ import tomllib
 from importlib.metadata import distributions, entry_points, packages_distributions
 from pathlib import Path
 
+import yaml
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
@@ -21,6 +22,9 @@ MAINTENANCE = {"fast-simplification"}
 
 OF_LIGHTNING = {"wandb", "mlflow-skinny"}
 """What Lightning imports where a recipe asks for it by `trainer.logger`."""
+
+
+MODELS = tomllib.loads((ROOT / "plugins/acwm_zoo/models/pyproject.toml").read_text())["project"]
 
 
 def names(requirements):
@@ -57,6 +61,13 @@ def test_imports_are_declared_and_declarations_imported():
         assert bringers & declared, f"{module} is imported and not declared"
         used |= bringers
     assert needed - used == OF_LIGHTNING
+
+
+def test_all_that_names_the_version_names_the_same():
+    version = PROJECT["version"]
+    assert (MODELS["version"], MODELS["dependencies"]) == (version, [f"acwm=={version}"])
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
+    assert f"## [{version}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_constraints_pin_every_dependency():

@@ -8,12 +8,15 @@ import torch
 import acwm
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.simulate import make_environment, simulate
+from acwm_core.errors import MissingExtraError
 from acwm_core.evaluation.results import Summary
 from acwm_core.model.build import build_world_model
+from acwm_core.plugins import Registry
 from acwm_core.recipe.recipe import compose
 from acwm_core.training.run import load_weights, read_metadata
 from acwm_core.training.run_folder import RunFolder
 from acwm_zoo.packing import FILES, MAX_BYTES
+from acwm_zoo.plugin import register_trained_models
 from acwm_zoo.shipped import about, folder, shipped
 
 ALL_BYTES = 90_000_000
@@ -31,6 +34,19 @@ def test_they_are_small_and_hold_nothing_else():
         weights.append(RunFolder(folder(name)).weights.stat().st_size)
     assert max(weights) <= MAX_BYTES
     assert sum(sizes.values()) <= ALL_BYTES
+
+
+def test_a_model_whose_files_are_not_installed_names_the_package(tmp_path, monkeypatch):
+    """As in acwm's own wheel, which has the cards of all models and the files of one."""
+    (tmp_path / "reacher").mkdir()
+    (tmp_path / "reacher/README.md").write_text("# A model\n")
+    monkeypatch.setattr("acwm_zoo.shipped.MODELS", tmp_path)
+    registry = Registry("trained_model")
+    register_trained_models(registry)
+    assert shipped() == []
+    assert "pip install acwm-models" in registry["reacher"].needs
+    with pytest.raises(MissingExtraError, match="pip install acwm-models"):
+        registry["reacher"].create()
 
 
 @pytest.mark.parametrize("name", shipped())
