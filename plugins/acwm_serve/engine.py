@@ -74,7 +74,7 @@ class Running:
     states: StateStream | None
     goal: Goal | None
     want: tuple[str, ...]
-    last: Tensor | None = None  # the last frame, `[1, 3, H, W]` in [0, 1]; None before the first
+    last: Tensor | None = None  # `[1, 3, H, W]` in [0, 1], for keypoints; None before the first
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ class Engine:
             whole = video if running.last is None else torch.cat([running.last, video])
             seen = self._world.read_keypoints(whole[None])
             answer["keypoints"] = seen.values[0, -1].cpu().numpy()
-        running.last = video[-1:]
+            running.last = video[-1:].clone()  # a view would keep the frames of all clients
         if running.goal is not None:
             answer |= self._distances(pixels, running.goal)
         return answer
