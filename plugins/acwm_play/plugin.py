@@ -1,4 +1,4 @@
-"""Registers the kind driver, one that plans, and `acwm play`."""
+"""Registers the kind driver, one that plans, one of trained policies, and `acwm play`."""
 
 from acwm_core.plugins import Registry, hookimpl
 
@@ -15,11 +15,16 @@ def register_kinds(registry: Registry) -> None:
 
 @hookimpl
 def register_drivers(registry: Registry) -> None:
-    """Add a driver."""
+    """Add the drivers of acwm."""
     registry.add(
         "planner",
         "acwm_play.planning_driver:PlanningDriver",
         summary="plans with the model in play",
+    )
+    registry.add(
+        "trained_policy",
+        "acwm_play.policy_driver:PolicyDriver",
+        summary="lets a policy of `acwm policy train` act in play",
     )
 
 

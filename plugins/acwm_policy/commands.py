@@ -84,9 +84,10 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
         raise click.BadParameter(f"give one model, not {', '.join(models)}")
     settings = settings_of([word for word in words if "=" in word])
 
+    from acwm_planning.policies.saved import default_folder
     from acwm_policy.train import train_policy
 
-    where = out or Path("runs/policies") / task
+    where = out or default_folder(task)
     model = models[0] if models else task.partition(".")[0]
     trained = train_policy(
         model, task, settings=settings, out=where, place=place, progress=True, **options

@@ -245,6 +245,11 @@ def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
         raise ValueError("its actions have no bounds")
 
 
+def default_folder(task: str) -> Path:
+    """Where `acwm policy train` writes a policy for ENVIRONMENT.TASK, and `acwm play` looks."""
+    return Path("runs/policies") / task
+
+
 def is_policy(name: str) -> bool:
     """Whether this is the folder of a saved policy."""
     return (Path(name) / POLICY_FILE).is_file()

@@ -15,7 +15,7 @@ function offer(about) {
     const label = make("label", "", "driver"), input = make("input"), text = make("span");
     Object.assign(input, { type: "radio", name: "driver", value: name, checked: state.driver === name });
     input.onchange = () => { driveBy(name); input.blur(); };
-    text.append(make("b", name[0].toUpperCase() + name.slice(1)), ...(k ? [] : [make("kbd", "L")]));
+    text.append(make("b", (name[0].toUpperCase() + name.slice(1)).replaceAll("_", " ")), ...(k ? [] : [make("kbd", "L")]));
     label.title = summary;
     label.append(input, text);
     document.querySelector("input[name=driver]").closest("fieldset").append(label);
