@@ -39,6 +39,13 @@ class Client:
         """Predict the frames that raw actions [N, A] lead to; N is a multiple of the stride."""
         return self._ask({"actions": np.asarray(actions, np.float32)})
 
+    def plan(self, frames, goal, **options):
+        """The next raw actions [N, A] towards a goal, from frames [N, H, W, 3] that were seen.
+
+        Options: actions between the frames, still (action for no motion), seed.
+        """
+        return self._ask({"observed": np.asarray(frames, np.uint8), "goal": goal, **options})
+
     def _ask(self, message):
         self.socket.send(msgpack.packb(message, default=as_map))
         return self._receive()

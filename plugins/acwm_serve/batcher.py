@@ -11,6 +11,7 @@ from typing import Any
 from acwm_core.errors import AcwmError, sentence
 from acwm_serve.engine import Answer, Engine, Running, Start, Step
 from acwm_serve.metrics import Metrics
+from acwm_serve.plans import PlanRequest
 
 GATHER = 0.002
 """Seconds to wait after a request for those of other clients, which come at the same time."""
@@ -22,7 +23,7 @@ class BusyError(AcwmError):
 
 @dataclass(eq=False)
 class _Request:
-    work: Start | Step  # what is still to be computed
+    work: Start | Step | PlanRequest  # what is still to be computed
     done: list[Answer] = field(default_factory=list[Answer])  # of the latent frames before
     answer: asyncio.Future[Any] = field(default_factory=lambda: asyncio.Future[Any]())
 
@@ -73,6 +74,14 @@ class Batcher:
         """
         return await self._ask(step)
 
+    async def plan(self, request: PlanRequest) -> Answer:
+        """The next actions towards a goal.
+
+        Raises:
+            BusyError: as for `start`.
+        """
+        return await self._ask(request)
+
     async def close(self) -> None:
         """Stop, once the current batch is computed."""
         if self._loop is not None:
@@ -82,7 +91,7 @@ class Batcher:
             request.answer.cancel()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
-    async def _ask(self, work: Start | Step) -> Any:
+    async def _ask(self, work: Start | Step | PlanRequest) -> Any:
         if len(self._waiting) >= self._queue:
             raise BusyError(f"{self._queue} requests wait already: send this one again later")
         request = _Request(work)
@@ -108,7 +117,7 @@ class Batcher:
             batch = [self._waiting.popleft() for _ in range(count)]
             self._metrics.waiting.set(len(self._waiting))
             loop = asyncio.get_running_loop()
-            for kind in (Start, Step):
+            for kind in (Start, Step, PlanRequest):
                 group = [request for request in batch if isinstance(request.work, kind)]
                 if group:
                     await loop.run_in_executor(self._thread, self._compute, group, loop)
@@ -116,10 +125,14 @@ class Batcher:
     def _compute(self, group: list[_Request], loop: asyncio.AbstractEventLoop) -> None:
         """Compute requests of one kind, in the thread."""
         works: Any = [request.work for request in group]
-        begins = isinstance(works[0], Start)
+        compute: Any = {
+            Start: self._engine.start,
+            Step: self._engine.step,
+            PlanRequest: self._engine.plan,
+        }[type(works[0])]
         self._metrics.batches.observe(len(group))
         try:
-            results: list[Any] = self._engine.start(works) if begins else self._engine.step(works)
+            results: list[Any] = compute(works)
         except Exception as error:  # whatever a component raises: the server goes on
             results = [AcwmError(sentence(error))] * len(group)
         for request, result in zip(group, results, strict=True):
@@ -131,7 +144,7 @@ class Batcher:
             return
         if isinstance(result, AcwmError):
             request.answer.set_exception(result)
-        elif isinstance(request.work, Start):
+        elif not isinstance(request.work, Step):
             request.answer.set_result(result)
         else:
             request.done.append(result)

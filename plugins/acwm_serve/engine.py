@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,10 @@ from acwm_core.model.state_stream import StateStream
 from acwm_core.model.stream import Stream
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
+from acwm_core.training.run_folder import find_run
+from acwm_planning.run import action_std_of
 from acwm_serve.joining import Joiner
+from acwm_serve.plans import GoalPlanner, PlanRequest
 
 Answer = dict[str, Any]
 """What a client receives: arrays by name."""
@@ -123,6 +126,7 @@ class Engine:
         self._world = world = bundle.world_model.to(choose_device(device))
         self.stride, self.given = world.codec.temporal_stride, world.context_frames
         self._task, self._estimator = self._judges(task)
+        self._action_std = action_std_of(find_run(run))
         self._joiner = Joiner([*world.modules(), world.objective])
         self.joins = self._tries_joining()
 
@@ -148,6 +152,11 @@ class Engine:
         }
         return tuple(name for name, there in able.items() if there)
 
+    @property
+    def plans(self) -> bool:
+        """Whether clients may ask for plans."""
+        return self._task is not None
+
     def facts(self) -> Answer:
         """What a client has to know, as it is sent when it connects."""
         action = self.card.action
@@ -164,6 +173,7 @@ class Engine:
             "want": [*self.wants],
             "keypoints": [*self._world.keypoint_names],
             "task": self._task.name if self._task else None,
+            "plans": self.plans,
             "unit": self._task.unit if self._task else None,
         }
 
@@ -173,14 +183,9 @@ class Engine:
         Raises:
             ShapeError, RecipeError: a value is missing or wrong.
         """
-        known = ("frames", "actions", "seed", "goal", "want")
-        for name in message:
-            if name not in known:
-                raise RecipeError(f"a start has no {name!r}{suggest(str(name), known)}")
+        _check_names(message, "a start", ("frames", "actions", "seed", "goal", "want"))
         between = message.get("actions", np.zeros((0, self.card.action.size), np.float32))
-        seed, want = message.get("seed", 0), message.get("want", [])
-        if type(seed) is not int or not 0 <= seed < 2**63:
-            raise RecipeError("seed is a whole number from 0 to 2^63 - 1")
+        seed, want = _seed(message), message.get("want", [])
         for name in want if isinstance(want, list) else [want]:
             if name not in self.wants:
                 has = ", ".join(self.wants) or "nothing besides frames"
@@ -194,6 +199,44 @@ class Engine:
         actions = self._actions(between, self.given - 1)
         return Start(frames, actions.numpy(), seed, goal, tuple(want))
 
+    def planner(self) -> GoalPlanner:
+        """The planner of a new session.
+
+        Raises:
+            RecipeError: the server has no task.
+        """
+        if self._task is None or self._estimator is None:
+            raise RecipeError("this server does not plan: start it with --task")
+        parts = self._world, self.card, self._task, self._estimator
+        return GoalPlanner(*parts, self._action_std)
+
+    def read_plan(self, message: Mapping[str, Any], planner: GoalPlanner) -> PlanRequest:
+        """Check a client's question for actions.
+
+        Raises:
+            ShapeError, RecipeError: a value is missing or wrong.
+        """
+        _check_names(message, "a plan", ("observed", "actions", "goal", "still", "seed"))
+        observed, spec = message["observed"], self.card.action
+        count = len(observed) if isinstance(observed, np.ndarray) and observed.ndim == 4 else 1
+        if not 1 <= count <= CHUNK * self.stride:
+            raise ShapeError(f"observed: 1 to {CHUNK * self.stride} frames, not {count}")
+        frames = self._picture("observed", observed, (count, *self.card.frame_size))
+        rows = message.get("actions", np.zeros((0, spec.size), np.float32))
+        actions, still = self._actions(rows, count - 1).numpy(), message.get("still")
+        if still is not None:
+            row = still[None] if isinstance(still, np.ndarray) else still
+            still = self._actions(row, 1, "still")[0]
+        elif spec.kind != "absolute":
+            still = torch.zeros(spec.size).clamp(torch.tensor(spec.low), torch.tensor(spec.high))
+        elif count > 1:
+            still = torch.from_numpy(actions[-1])
+        else:
+            raise RecipeError("actions are positions: give `still`, the action for no motion now")
+        goal = self._picture("goal", message.get("goal"), self.card.frame_size)
+        seed = _seed(message)
+        return PlanRequest(planner, frames, actions, goal, still.numpy(), seed)
+
     def read_actions(self, message: Mapping[str, Any]) -> tuple[Tensor, ...]:
         """Check a client's further message; the actions `[stride, A]` of each latent frame.
 
@@ -201,7 +244,9 @@ class Engine:
             ShapeError, RecipeError: a value is missing or wrong.
         """
         if {*message} != {"actions"}:
-            raise RecipeError("send `frames` to start, and then `actions`")
+            raise RecipeError(
+                "send `frames` to start, and then `actions`; or `observed` for a plan"
+            )
         rows, stride = message["actions"], self.stride
         count = len(rows) if isinstance(rows, np.ndarray) and rows.ndim == 2 else 0
         if not count or count % stride or count > CHUNK * stride:
@@ -211,10 +256,10 @@ class Engine:
             )
         return torch.split(self._actions(rows, count), stride)
 
-    def _actions(self, rows: Any, count: int) -> Tensor:
+    def _actions(self, rows: Any, count: int, name: str = "actions") -> Tensor:
         wanted = (count, self.card.action.size)
         if not isinstance(rows, np.ndarray) or rows.shape != wanted or rows.dtype.kind not in "fiu":
-            raise ShapeError(f"actions are numbers {list(wanted)}, not {_described(rows)}")
+            raise ShapeError(f"{name} are numbers {list(wanted)}, not {_described(rows)}")
         actions = torch.from_numpy(rows.astype(np.float32))
         return self._world.checked(actions[None])[0] if count else actions
 
@@ -248,6 +293,18 @@ class Engine:
             now = {} if states is None else {n: v[0][None] for n, v in states.current.items()}
             made.append((running, self._answer(running, shown, now)))
         return made
+
+    def plan(self, requests: Sequence[PlanRequest]) -> list[Answer | AcwmError]:
+        """Plan for clients, one after the other; `actions` `[N, A]` each."""
+        answers: list[Answer | AcwmError] = []
+        for request in requests:
+            try:
+                with noting("while the model plans", *self._world.children()):
+                    actions = request.planner.plan(request, self._goal(request.goal))
+                answers.append({"actions": actions})
+            except Exception as error:  # of a component; other clients go on
+                answers.append(AcwmError(sentence(error)))
+        return answers
 
     def step(self, steps: Sequence[Step]) -> list[Answer | AcwmError]:
         """Move videos by one latent frame each, those that are alike in one forward pass."""
@@ -375,6 +432,19 @@ class Engine:
         frames = whole.step(rows)
         parts[:] = self._joiner.parted(whole, TRIAL)
         return bool((frames - wanted).abs().mean() <= CLOSE)
+
+
+def _check_names(message: Mapping[str, Any], what: str, known: Collection[str]) -> None:
+    for name in message:
+        if name not in known:
+            raise RecipeError(f"{what} has no {name!r}{suggest(str(name), known)}")
+
+
+def _seed(message: Mapping[str, Any]) -> int:
+    seed = message.get("seed", 0)
+    if type(seed) is not int or not 0 <= seed < 2**63:
+        raise RecipeError("seed is a whole number from 0 to 2^63 - 1")
+    return seed
 
 
 def _described(value: Any) -> str:

@@ -21,6 +21,7 @@ from acwm_serve.batcher import Batcher
 from acwm_serve.engine import CHUNK, Answer, Engine, Running, Step
 from acwm_serve.messages import packed, unpacked
 from acwm_serve.metrics import Metrics
+from acwm_serve.plans import GoalPlanner
 
 HEARTBEAT = 20.0
 """Seconds after which the server notices that a client is gone."""
@@ -50,6 +51,14 @@ class Limits:
     idle: float = 300.0
 
 
+@dataclass
+class Session:
+    """What one client has begun."""
+
+    running: Running | None = None
+    planner: GoalPlanner | None = None
+
+
 class Server:
     """The routes of one server.
 
@@ -64,7 +73,8 @@ class Server:
         self._metrics = Metrics()
         self._sockets: set[web.WebSocketResponse] = set()
         size, actions = engine.card.frame_size, engine.card.action.size
-        pixels = (engine.given + 1) * size[0] * size[1] * 3
+        frames = max(engine.given, CHUNK * engine.stride if engine.plans else 0) + 1
+        pixels = frames * size[0] * size[1] * 3
         self._most = pixels + 8 * CHUNK * engine.stride * actions + SLACK
 
     def application(self) -> web.Application:
@@ -137,16 +147,16 @@ class Server:
     async def _serve(self, socket: web.WebSocketResponse) -> None:
         """Answer one client until it leaves."""
         await socket.send_bytes(packed(self._engine.facts()))
-        running: Running | None = None
+        session = Session()
         async for message in self._messages(socket):
             began = time.monotonic()
             try:
-                running, answer = await self._answer(message.data, running)
+                answer = await self._answer(message.data, session)
             except AcwmError as error:
                 self._metrics.refused.inc()
                 await socket.send_str(sentence(error))
                 continue
-            self._metrics.frames.inc(len(answer["frames"]))
+            self._metrics.frames.inc(len(answer.get("frames", ())))
             self._metrics.latency.observe(time.monotonic() - began)
             await socket.send_bytes(packed(answer))
 
@@ -173,17 +183,21 @@ class Server:
         finally:
             receiving.cancel()
 
-    async def _answer(self, data: Any, running: Running | None) -> tuple[Running, Answer]:
-        """The video after a message, and what to send."""
+    async def _answer(self, data: Any, session: Session) -> Answer:
+        """What to send after a message."""
         if not isinstance(data, bytes):
             raise DataError("a message is a map in msgpack, not text")
         message = unpacked(data)
+        if "observed" in message:
+            session.planner = session.planner or self._engine.planner()
+            return await self._batcher.plan(self._engine.read_plan(message, session.planner))
         if "frames" in message:
-            return await self._batcher.start(self._engine.read_start(message))
-        if running is None:
+            session.running, answer = await self._batcher.start(self._engine.read_start(message))
+            return answer
+        if session.running is None:
             raise RecipeError("send `frames` to start, and then `actions`")
-        step = Step(running, self._engine.read_actions(message))
-        return running, _chained(await self._batcher.step(step))
+        step = Step(session.running, self._engine.read_actions(message))
+        return _chained(await self._batcher.step(step))
 
 
 def _chained(answers: list[Answer]) -> Answer:

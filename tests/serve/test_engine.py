@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from acwm_core.errors import AcwmError
+from acwm_core.errors import AcwmError, RecipeError, ShapeError
 from acwm_core.training.run import load_run
 from acwm_serve import engine as engines
 from acwm_serve.engine import Engine, Step
@@ -194,3 +194,42 @@ def test_states_are_those_that_the_model_predicts():
         for name, values in world.predict_states(frame, inputs, seeds=[row]).items():
             own = np.concatenate([step[row][name] for step in shown])
             assert np.allclose(own, values[0].numpy(), atol=1e-4, equal_nan=True)
+
+
+def test_plans_reach_the_goal(exact, monkeypatch):
+    """The model knows its world, so acting by its plans alone solves the task."""
+    few = ("planner.candidates=64", "planner.elites=8", "planner.iterations=3", "past=0")
+    monkeypatch.setattr(tiny.ToPlace, "planning", few, raising=False)
+    engine, world = Engine(exact, task="place", device="cpu"), tiny.task_environment()
+    frame, info = world.reset(options={"spec": tiny.spec(1)})
+    goal, frames, actions, planner = info["goal"].frame, [frame], [], engine.planner()
+    while not info["success"] and len(actions) < 32:
+        message = {"observed": np.stack(frames), "goal": goal}
+        if actions:
+            message["actions"] = np.stack(actions)
+        (answer,) = engine.plan([engine.read_plan(message, planner)])
+        for action in answer["actions"]:
+            frame, *_, info = world.step(action)
+            frames.append(frame)
+            actions.append(action)
+    assert info["success"]
+
+
+def test_what_is_wrong_with_a_question_for_a_plan_is_said(exact, carrying):
+    with pytest.raises(RecipeError, match="--task"):
+        Engine(carrying, device="cpu").planner()
+    engine = Engine(exact, task="place", device="cpu")
+    planner, frames = engine.planner(), np.zeros((2, 32, 32, 3), np.uint8)
+    between = np.zeros((1, 2), np.float32)
+    whole = {"observed": frames, "actions": between, "goal": frames[0]}
+    assert engine.read_plan(whole, planner).still.shape == (2,)
+    for name, value in {
+        "observed": frames[:, :8],
+        "actions": between[:0],
+        "goal": frames,
+        "still": np.zeros(3),
+        "seed": -1,
+        "aim": 1,
+    }.items():
+        with pytest.raises((ShapeError, RecipeError), match=name):
+            engine.read_plan({**whole, name: value}, planner)

@@ -273,3 +273,17 @@ def test_a_port_that_is_taken_and_a_short_token_are_told(exact):
         assert "give another --host or --port" in told.output
     told = CliRunner().invoke(main, ["serve", str(exact), "--token", "secret"])
     assert "at least 16 plain characters" in told.output
+
+
+def test_a_client_receives_plans_beside_frames(served, exact, carrying, client_class):
+    frame, goal = picture(0, SIZE), picture(1, SIZE)
+    with client_class(served(exact, task="place").address, TOKEN) as client:
+        assert client.facts["plans"]
+        planned = client.plan(frame[None], goal, seed=1)["actions"]
+        assert planned.shape[1] == 2
+        assert np.abs(planned).max() <= 2
+        assert client.start(frame)["frames"].shape == (1, *SIZE, 3)
+    with client_class(served(carrying).address, TOKEN) as client:
+        assert not client.facts["plans"]
+        with pytest.raises(RuntimeError, match="--task"):
+            client.plan(frame[None], goal)
