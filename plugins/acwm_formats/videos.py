@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
 from acwm_formats.names import composed, exact, folded, is_action, word, words
+from acwm_formats.picture_names import keys, numbered, title, told_apart
 from acwm_formats.sources import VIDEOS, damage_of, files_in, guarded
 from acwm_formats.tables import (
     FRAMES,
@@ -45,10 +45,6 @@ from acwm_formats.timeline import (
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
-OWNER = r"(ep|eps|episode|traj|trajectory|demo|rollout|trial|take|run|seq|sequence|clip)s?[\W_]*\d"
-"""How names of pictures begin whose first number is that of their episode."""
-
-
 class VideoEpisode(NamedTuple):
     """Where one episode lies.
 
@@ -57,7 +53,8 @@ class VideoEpisode(NamedTuple):
         cameras: a video file, or a folder of pictures, by the name of the camera.
         table: the file with its actions; None if there is none, or one for all.
         tables: names of several that could be it.
-        begins: what the names of its pictures begin with, if the folder holds several episodes.
+        begins: the part of its pictures' names that has its number, if a folder holds several
+            episodes.
         rows: its first row, the row after its last and the number of all, in a table for all whose
             rows belong to pictures by their place.
     """
@@ -265,7 +262,7 @@ class VideoFolder:
         """A video, or pictures with the times of `rate` or else of the table's rows."""
         if source.is_file():
             return VideoFrames(source)
-        paths = [path for path in _pictures(source) if _begins(path) == begins or not begins]
+        paths = [path for path in _pictures(source) if not begins or begins in dict(keys(path))]
         if self.rate:
             times = regular_times(len(paths), exact(self.rate))
         elif times is None or len(times) != len(paths) or _counts_rows(times):
@@ -384,39 +381,23 @@ def _grouped(folder: Path, table: Path | None) -> list[VideoEpisode]:
     """The episodes of a folder whose pictures are numbered in each, as ``ep_0_step_0.png``.
 
     They are numbered anew; or on, if the name says what its first number counts, as ``ep0_000``.
+    The number of the episode may come last, as in ``frame_0_ep_0.png``.
 
     Raises:
-        DataError: they are the pictures of several cameras.
+        DataError: they are the pictures of several cameras, or of episodes that cannot be told.
     """
-    groups: dict[str, list[int]] = {}
-    for path in _pictures(folder):
-        number = re.search(r"(\d+)\D*$", path.stem)
-        groups.setdefault(_begins(path), []).append(int(number[1]) if number else -1)
-    first = next(iter(groups.values()), [])
-    anew = all(n == [*range(n[0], n[0] + len(n))] and n[0] == first[0] for n in groups.values())
-    every = [number for numbers in groups.values() for number in numbers]
-    named = all(re.match(OWNER, begins.lower()) for begins in groups)
-    numbered = anew or (named and bool((np.diff(every) == 1).all()))
-    if len(groups) < 2 or not numbered or not all(re.search(r"\d", b) for b in groups):
+    paths = [path for path in _pictures(folder) if numbered(path)]
+    groups = told_apart(folder, paths) if paths else {}
+    if not groups:
         return []
-    if re.match(r"(cam|camera|view|eye)", next(iter(groups)).lower()):
-        raise DataError(f"{folder} has pictures of several cameras: put each into a folder")
+    if stray := [path.name for path in _pictures(folder) if path not in paths]:
+        raise DataError(f"{folder} has pictures of several recordings, and {stray[0]}: remove it")
     ends = np.cumsum([len(numbers) for numbers in groups.values()]).tolist()
     starts = [0, *ends[:-1]]
     return [
-        VideoEpisode(_title(begins), {"video": folder}, table, (), begins, (start, stop, ends[-1]))
-        for begins, start, stop in zip(groups, starts, ends, strict=True)
+        VideoEpisode(title(key), {"video": folder}, table, (), key, (start, stop, ends[-1]))
+        for key, start, stop in zip(groups, starts, ends, strict=True)
     ]
-
-
-def _begins(path: Path) -> str:
-    """The name of a picture up to its last number."""
-    return re.sub(r"\d+\D*$", "", path.stem)
-
-
-def _title(begins: str) -> str:
-    """What an episode of pictures is called: the part of their names up to its number."""
-    return re.sub(r"\D+$", "", begins)
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -542,7 +523,7 @@ def _notes(
         notes.append(f"Columns that are neither actions nor states: {', '.join(left)}.")
     notes += text_note(chosen.texts)
     if places[0].begins:
-        notes.append(f"Pictures are {len(places)} episodes, by the first number in their names.")
+        notes.append(f"Pictures are {len(places)} episodes, by the numbers in their names.")
     if chosen.time is None and chosen.frame is None:
         notes.append(
             "Rows belong to frames by their number, because the tables have no column of times."

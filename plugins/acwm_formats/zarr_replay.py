@@ -6,24 +6,30 @@ import contextlib
 import functools
 import itertools
 import math
-from collections.abc import Generator, Iterable, Mapping
+import re
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
+import numcodecs.abc
+import numcodecs.errors
 import numpy as np
 import zarr
+import zarr.errors
 from numpy.typing import NDArray
-from zarr.storage import LocalStore, WrapperStore, ZipStore
+from zarr.abc.codec import BytesBytesCodec
+from zarr.storage import LocalStore, ZipStore
 
-from acwm_core.arrays import check_unpacked
+from acwm_core.arrays import LARGE, check_unpacked
 from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout, ArrayStore, StoredEpisode, StoredEpisodes
 from acwm_formats.channels import Channels
 from acwm_formats.episode_bounds import bounds_of, tells
 from acwm_formats.format import Format
-from acwm_formats.frames import MOST_FRAMES, stack_note
+from acwm_formats.frames import DENSE, MOST_FRAMES, stack_note
 from acwm_formats.images import CHANNELS, MOST_BYTES
 from acwm_formats.names import exact, pair, typed, word, words
 from acwm_formats.packed import check_packed
@@ -50,24 +56,22 @@ ACTIONS = ("action", "actions")
 NUMBERS, TEXTS = "fiub", "SUTO"
 """NumPy's kinds of dtypes that hold numbers, and of those that may hold texts."""
 
-CODECS = (
-    *(
-        "blosc",
-        "zstd",
-        "zlib",
-        "lz4",
-        "gzip",
-        "bz2",
-        "lzma",
-        "shuffle",
-        "delta",
-        "fixedscaleoffset",
-    ),
-    *("BloscCodec", "ZstdCodec", "GzipCodec", "BytesCodec", "TransposeCodec", "Crc32cCodec"),
-    *("ShardingCodec", "imagecodecs_jpegxl", "imagecodecs_jpeg2k", "imagecodecs_webp"),
-    *("vlen-utf8", "VLenUTF8Codec"),
-)
+PACKERS = frozenset({"blosc", "zstd", "zlib", "lz4", "gzip", "bz2", "lzma"})
+CODECS = PACKERS | {
+    *("shuffle", "delta", "fixedscaleoffset", "astype", "bitround", "quantize", "packbits"),
+    *("crc32", "crc32c", "adler32", "fletcher32", "bytes", "transpose", "sharding", "vlenutf8"),
+    *("imagecodecs_jpegxl", "imagecodecs_jpeg2k", "imagecodecs_webp"),
+}
 """Codecs of numbers and images. Others are refused: those of objects run code as they read."""
+
+WIDEST = 8
+"""How many times larger numbers may be as a filter has them than in the array."""
+
+LEAST = 2**20
+"""Bytes that a chunk may always unpack to: how many it does is known roughly before."""
+
+MOST_PIECES = 2**16
+"""Chunks of a row, or of a shard, all of which are listed to read one."""
 
 MOST_LOOKED_AT = 1000  # files
 
@@ -170,6 +174,8 @@ def _notes(
     notes = [f"Arrays that were left out: {', '.join(left)}."] if left else []
     for name in cameras:
         array = buffer.array(f"data/{name}")
+        if array.nbytes > LARGE + DENSE * (stored := array.nbytes_stored()):
+            raise DataError(f"{name} of {buffer.path} claims {array.nbytes:,} bytes in {stored:,}")
         if lacking := array.nchunks - array.nchunks_initialized:
             notes.append(
                 f"{lacking} of {array.nchunks} chunks of {name} are not stored, and read as "
@@ -181,19 +187,77 @@ def _notes(
     return tuple(notes)
 
 
-class _Checked(WrapperStore[Any]):
-    """A store whose chunks unpack to no more than they may; the decoder would find out too late."""
+@dataclass(frozen=True)
+class _Measure(BytesBytesCodec):
+    """Stands before a codec as chunks are read, and refuses those that unpack to too much.
 
-    async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-        """The bytes of a key.
+    Attributes:
+        codec: the name of the codec that comes next.
+        most: how many bytes a chunk may unpack to; None for texts.
+    """
+
+    codec: str
+    most: int | None
+
+    async def _decode_single(self, chunk_data: Any, chunk_spec: Any) -> Any:
+        check_packed(chunk_data.to_bytes(), self.codec, self.most)
+        return chunk_data
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: Any) -> int:
+        """As in `BytesBytesCodec`: it leaves chunks as they are."""
+        return input_byte_length
+
+
+class _Measured(numcodecs.abc.Codec):
+    """A codec of Zarr's version 2 that refuses chunks which unpack to too much."""
+
+    codec_id = "measured"
+
+    def __init__(self, codec: Any, most: int | None) -> None:
+        self._codec, self._most = codec, most
+
+    def encode(self, buf: Any) -> Any:
+        """As in `Codec`."""
+        return self._codec.encode(buf)
+
+    def decode(self, buf: Any, out: Any = None) -> Any:
+        """As in `Codec`.
 
         Raises:
-            ValueError: they unpack to far more than they are.
+            ValueError: the bytes unpack to far more than they are, or than they may.
         """
-        found = await super().get(key, prototype, byte_range)
-        if found is not None:
-            check_packed(found.as_numpy_array().view(np.uint8).data)
-        return found
+        check_packed(memoryview(buf).cast("B"), _kind(self._codec), self._most)
+        return self._codec.decode(buf, out)
+
+
+def _kind(codec: Any) -> str:
+    """The name of a codec, without what the versions of Zarr add to it."""
+    name = getattr(codec, "codec_id", type(codec).__name__)
+    return name.lower().removesuffix("codec").replace("-", "")
+
+
+def _parts(codecs: Iterable[Any]) -> Iterator[Any]:
+    """Codecs, and those within them: of shards, and of version 2."""
+    for codec in codecs:
+        if hasattr(codec, "compressor"):
+            yield from (part for part in (*(codec.filters or ()), codec.compressor) if part)
+        else:
+            yield codec
+            yield from _parts(getattr(codec, "codecs", ()))
+
+
+def _measured(codecs: Iterable[Any], most: int | None) -> Iterator[Any]:
+    """The same codecs, which measure chunks before they unpack them."""
+    for codec in codecs:
+        if hasattr(codec, "compressor"):
+            packed = codec.compressor and _Measured(codec.compressor, most)
+            filters = tuple(_Measured(each, most) for each in codec.filters or ())
+            yield replace(codec, compressor=packed, filters=filters)
+            continue
+        shards = hasattr(codec, "codecs")
+        yield replace(codec, codecs=tuple(_measured(codec.codecs, most))) if shards else codec
+        if _kind(codec) in (*PACKERS, "vlenutf8"):
+            yield _Measure(_kind(codec), most)
 
 
 class Buffer(ArrayStore):
@@ -213,7 +277,7 @@ class Buffer(ArrayStore):
                     sizes = (member.file_size for member in packed.infolist())
                     check_unpacked(path.stat().st_size, sum(sizes))
             kind: Any = ZipStore if path.is_file() else LocalStore
-            store = _Checked(kind(path.absolute(), read_only=True))
+            store = kind(path.absolute(), read_only=True)
             self._group: Any = zarr.open_group(store, mode="r")
 
     def __reduce__(self) -> Any:
@@ -245,16 +309,40 @@ class Buffer(ArrayStore):
             return self._found[name]
         with damage_of(self.path / name), _pointers_named(self.path / name):
             array = self._group[name]
-            codecs = [*array.filters, *array.compressors]
-            used = [getattr(codec, "codec_id", type(codec).__name__) for codec in codecs]
-        if array.dtype.kind not in NUMBERS + TEXTS or not {*used} <= {*CODECS}:
-            raise DataError(f"{name} of {self.path} holds {array.dtype} by {used}, not numbers")
-        chunk = math.prod(array.chunks) * array.dtype.itemsize
-        if max(chunk / 2, math.prod(array.shape[1:]) * array.dtype.itemsize) > MOST_BYTES:
+            pipeline = array.async_array.codec_pipeline
+            parts = [*_parts(pipeline)]
+            used = [_kind(codec) for codec in parts]
+        if array.dtype.kind not in NUMBERS + TEXTS:
+            raise DataError(f"{name} of {self.path} holds {array.dtype}, not numbers")
+        if unknown := [codec for codec in used if codec not in CODECS]:
+            raise DataError(
+                f"{name} of {self.path} is stored by {unknown[0]}, which is not read: store it "
+                "again with another codec, such as zstd"
+            )
+        if (times := sum(codec in PACKERS for codec in used)) > 1:
+            raise DataError(
+                f"{name} of {self.path} is compressed {times} times: store it with one codec"
+            )
+        row, chunk = (
+            math.prod(shape) * array.dtype.itemsize
+            for shape in (array.shape[1:], array.shards or array.chunks)
+        )
+        if max(chunk / 2, row) > MOST_BYTES:
             raise DataError(
                 f"{name} of {self.path} claims rows {list(array.shape[1:])} in chunks of {chunk:,} "
                 "bytes, more than are read"
             )
+        grain = [array.chunks, *(part.chunk_shape for part in parts if _kind(part) == "sharding")][
+            -1
+        ]
+        whole = array.shards or (grain[:1] + array.shape[1:])
+        if (
+            pieces := math.prod(-(-size // step) for size, step in zip(whole, grain, strict=True))
+        ) > MOST_PIECES:
+            raise DataError(f"{name} of {self.path} claims {pieces:,} chunks in a row or shard")
+        most = max(WIDEST * chunk, LEAST) if array.dtype.kind in NUMBERS else None
+        measured = pipeline.from_codecs([*_measured(pipeline, most)])
+        object.__setattr__(array.async_array, "codec_pipeline", measured)  # it is a frozen class
         self._found[name] = array
         return array
 
@@ -321,9 +409,15 @@ class Buffer(ArrayStore):
 
 @contextlib.contextmanager
 def _pointers_named(root: Path) -> Generator[None]:
-    """Where the block fails, report a file that Git LFS has not fetched as the cause."""
+    """Where the block fails, report files that Git LFS has not fetched, or an unknown codec."""
     try:
         yield
+    except (numcodecs.errors.UnknownCodecError, zarr.errors.UnknownCodecError) as error:
+        codec = re.sub(r".*: |['\"]", "", str(error))
+        raise DataError(
+            f"{root} has arrays stored by {codec}, which is not installed: store them again with "
+            "another codec, such as zstd"
+        ) from error
     except Exception:
         for path in itertools.islice(root.rglob("*"), MOST_LOOKED_AT):
             if path.is_file():

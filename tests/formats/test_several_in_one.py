@@ -9,7 +9,7 @@ from acwm_core.errors import DataError
 from acwm_formats.alignment import Alignment, align
 from acwm_formats.episode_bounds import bounds_of
 from acwm_formats.hdf5 import HDF5
-from acwm_formats.videos import Videos
+from acwm_formats.videos import Videos, find_places
 from acwm_formats.zarr_replay import ZarrReplay
 from tests.formats.corpus.cases import at
 from tests.formats.corpus.clips import Clip, write_clip, write_images
@@ -217,6 +217,71 @@ def test_pictures_of_several_episodes_in_one_folder(tmp_path, pattern, says, tab
     found = Videos().read(tmp_path, rate=10)
     assert are_the_four(found.splits)
     assert any("4 episodes" in note for note in found.notes)
+
+
+LAST = {
+    "two numbers": "{s}_{e}.png",
+    "words": "frame_{s}_ep_{e}.png",
+    "a word for frames": "frame{s:04d}_{e1}.png",
+    "a word for episodes": "{s1:03d}-episode{e}.png",
+}
+
+
+@pytest.mark.parametrize("pattern", LAST.values(), ids=LAST)
+def test_pictures_whose_episode_comes_last(tmp_path, pattern):
+    pictured(tmp_path / "pixels", pattern)
+    np.savez(tmp_path / "all.npz", action=ROWS)
+    assert are_the_four(Videos().read(tmp_path, rate=10).splits)
+
+
+def named(folder, names):
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_bytes(b"")
+    (folder / "a.csv").write_text("x\n" + "1\n" * len(names))
+
+
+EQUAL = [(e, s) for e in range(3) for s in range(5)]
+GAPS = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (1, 3), (2, 0), (2, 1)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "numbers", "why"),
+    [
+        ("{0}_{1}.png", EQUAL, "either number may be"),
+        ("{1}_{0}.png", EQUAL, "either number may be"),
+        ("img_{0}_{1}.png", EQUAL, "either number may be"),
+        ("ep_{0}_step_{1}.png", GAPS, "not numbered one by one"),
+        ("step_{1}_ep_{0}.png", GAPS, "not numbered one by one"),
+        ("{0}_{1}.png", GAPS, "not numbered one by one"),
+        ("{1}_{0}.png", GAPS, "not numbered one by one"),
+        ("{0}_{1}0.png", EQUAL, "not numbered one by one"),
+        ("step_{1}_cam_{0}.png", EQUAL, "several cameras"),
+    ],
+)
+def test_several_recordings_that_cannot_be_told_apart_are_refused(tmp_path, pattern, numbers, why):
+    named(tmp_path / "a", [pattern.format(*pair) for pair in numbers])
+    with pytest.raises(DataError, match=why):
+        find_places(tmp_path)
+
+
+def test_a_picture_beside_those_of_several_recordings_is_refused(tmp_path):
+    named(tmp_path / "a", ["cover.png", *(f"ep{e}_{s}.png" for e, s in EQUAL)])
+    with pytest.raises(DataError, match=r"and cover\.png: remove it"):
+        find_places(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "count"),
+    [
+        *[(name, 3) for name in ("ep_{0}_step_{1}.png", "{0}_frame{1}.png", "frame{1}_{0}.png")],
+        *[(name, 1) for name in ("0_{2}.png", "{2}_0.png", "f{2:04d}_640x480.png")],
+        *[(name, 1) for name in ("2024-01-05_12-0{0}-0{1}.png", "170000000{0}_{1}.png")],
+    ],
+)
+def test_words_and_times_in_names_of_pictures(tmp_path, pattern, count):
+    named(tmp_path / "a", [pattern.format(e, s, 5 * e + s) for e, s in EQUAL])
+    assert len(find_places(tmp_path)) == count
 
 
 def test_pictures_whose_rows_are_of_another_number_are_refused(tmp_path):

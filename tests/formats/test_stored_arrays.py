@@ -1,8 +1,10 @@
 """HDF5, Zarr and Minari: what their layouts say, and files that reach for others or for code."""
 
 import json
+import lzma
 import pickle
 import zipfile
+import zlib
 
 import h5py
 import numcodecs
@@ -10,9 +12,7 @@ import numpy as np
 import pytest
 import zarr
 
-import acwm_core.arrays
 from acwm_core.errors import DataError
-from acwm_formats import packed
 from acwm_formats.hdf5 import HDF5
 from acwm_formats.minari_datasets import Minari
 from acwm_formats.packed import GZIP, ZSTD, check_packed, zstd_size
@@ -78,20 +78,148 @@ def test_codecs_that_run_code_are_refused(tmp_path, codec):
         ZarrReplay().read(path, **options)
 
 
-@pytest.mark.parametrize("codec", ["zstd", "gzip", "bz2", "zlib"])
-def test_chunks_that_unpack_to_gigabytes_are_refused(tmp_path, monkeypatch, codec):
-    for module in (acwm_core.arrays, packed):
-        monkeypatch.setattr(module, "LARGE", 2**20)  # in place of 256 MB
-    path, options = arrays.replay(tmp_path, PLAIN)
+CODECS = {
+    "blosc": numcodecs.Blosc("lz4"),
+    "zstd": numcodecs.Zstd(),
+    "gzip": numcodecs.GZip(),
+    "bz2": numcodecs.BZ2(),
+    "zlib": numcodecs.Zlib(),
+    "lz4": numcodecs.LZ4(),
+    "lzma": numcodecs.LZMA(),
+    "old lzma": numcodecs.LZMA(format=lzma.FORMAT_ALONE),
+}
+
+
+def replaced(path, codec, chunk):
+    """Say that frames are compressed by a codec, and put the same bytes into all chunks."""
     described = json.loads((path / "data/img/.zarray").read_text())
-    described |= {"compressor": {"id": codec, "level": 1}, "filters": None}
+    described |= {"compressor": codec.get_config(), "filters": None}
     (path / "data/img/.zarray").write_text(json.dumps(described))
-    bomb = numcodecs.get_codec({"id": codec, "level": 1}).encode(bytes(3 * 2**20))
-    for chunk in (path / "data/img").glob("[0-9]*"):
-        chunk.write_bytes(bomb)
-    recording = ZarrReplay().read(path, **options).splits[0]
-    with pytest.raises(DataError, match="claim to hold"):
-        next(iter(recording.cameras["img"].read([0])))
+    for place in (path / "data/img").glob("[0-9]*"):
+        place.write_bytes(chunk)
+
+
+def first_frame(path, options):
+    return next(iter(ZarrReplay().read(path, **options).splits[0].cameras["img"].read([0])))
+
+
+@pytest.mark.parametrize("codec", CODECS.values(), ids=CODECS)
+def test_chunks_of_every_codec(tmp_path, codec):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    chunks = zarr.open_array(str(path / "data/img"), mode="r").chunks
+    frames = np.random.default_rng(0).integers(0, 256, chunks, np.uint8)
+    replaced(path, codec, codec.encode(frames))
+    np.testing.assert_array_equal(first_frame(path, options), frames[0])
+    replaced(path, codec, codec.encode(bytes(3 * 2**20)))
+    with pytest.raises(DataError, match="unpack to more than the 1,"):
+        first_frame(path, options)
+
+
+SECOND = {
+    "zstd": numcodecs.Zstd().encode(b"1"),
+    "a frame that zstd skips": b"\x50\x2a\x4d\x18\x02\x00\x00\x00ab",
+    "gzip": numcodecs.GZip().encode(b"1"),
+    "bz2": numcodecs.BZ2().encode(b"1"),
+    "lzma": numcodecs.LZMA().encode(b"1"),
+}
+
+
+@pytest.mark.parametrize("before", SECOND)
+def test_bombs_behind_a_harmless_beginning(tmp_path, before):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    codec = CODECS.get(before, CODECS["zstd"])
+    replaced(path, codec, SECOND[before] + codec.encode(bytes(3 * 2**20)))
+    with pytest.raises(DataError, match="unpack to more than the 1,"):
+        first_frame(path, options)
+
+
+def test_bombs_by_another_header_and_claims(tmp_path):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    small = zlib.compressobj(9, zlib.DEFLATED, 10)
+    replaced(path, CODECS["zlib"], small.compress(bytes(3 * 2**20)) + small.flush())
+    with pytest.raises(DataError, match="unpack to more than the 1,"):
+        first_frame(path, options)
+    replaced(path, CODECS["lz4"], (2**31 - 1).to_bytes(4, "little") + b"aaaa")
+    with pytest.raises(DataError, match="8 bytes claim to hold 2,147,483,647"):
+        first_frame(path, options)
+    check_packed((3).to_bytes(4, "little") + bytes(12), "vlenutf8")
+    with pytest.raises(ValueError, match="4 bytes claim to hold 17,179,869,176"):
+        check_packed((2**31 - 1).to_bytes(4, "little"), "vlenutf8")
+
+
+def sharded(path, compressor):
+    """The same as `arrays.replay`, in shards of six frames, and what is in them."""
+    frames = np.random.default_rng(0).integers(0, 256, (18, 32, 32, 3), np.uint8)
+    group = zarr.open_group(str(path), mode="w", zarr_format=3)
+    inner, outer = (1, 32, 32, 3), (6, 32, 32, 3)
+    group.create_array("data/img", data=frames, chunks=inner, shards=outer, compressors=compressor)
+    group.create_array("data/action", data=np.zeros((18, 2), np.float32))
+    group.create_array("meta/episode_ends", data=np.array([6, 12, 18]))
+    return frames
+
+
+IN_SHARDS = {
+    "gzip": (zarr.codecs.GzipCodec(), CODECS["gzip"]),
+    "zstd": (zarr.codecs.ZstdCodec(), CODECS["zstd"]),
+    "blosc": (zarr.codecs.BloscCodec(), CODECS["blosc"]),
+    "lz4": (zarr.codecs.numcodecs.LZ4(), CODECS["lz4"]),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr version 3")
+@pytest.mark.parametrize(("compressor", "codec"), IN_SHARDS.values(), ids=IN_SHARDS)
+def test_chunks_in_shards(tmp_path, compressor, codec):
+    path = tmp_path / "b.zarr"
+    frames = sharded(path, compressor)
+    np.testing.assert_array_equal(first_frame(path, {"rate": 10}), frames[0])
+    bomb = codec.encode(bytes(3 * 2**20))
+    index = np.array([[place * len(bomb), len(bomb)] for place in range(6)], "<u8").tobytes()
+    check = numcodecs.CRC32C(location="end").encode(index)
+    for shard in (path / "data/img/c").rglob("*"):
+        if shard.is_file():
+            shard.write_bytes(bomb * 6 + bytes(check))
+    with pytest.raises(DataError, match="unpack to more than the 1,"):
+        first_frame(path, {"rate": 10})
+
+
+def forge(path, array, **changes):
+    place = path / array / "zarr.json"
+    place.write_text(json.dumps(json.loads(place.read_text()) | changes))
+
+
+def test_zarr_that_is_more_than_it_can_be(tmp_path):
+    path = tmp_path / "b.zarr"
+    sharded(path, zarr.codecs.ZstdCodec())
+    about = json.loads((path / "data/img/zarr.json").read_text())
+    about["codecs"][0]["configuration"]["chunk_shape"] = [1, 1, 1, 1]
+    about["chunk_grid"]["configuration"]["chunk_shape"] = [6, 4096, 4096, 3]
+    forge(path, "data/img", shape=[18, 4096, 4096, 3], **{k: about[k] for k in FORGED})
+    with pytest.raises(DataError, match="claims 301,989,888 chunks in a row or shard"):
+        ZarrReplay().read(path, rate=10)
+    sharded(path, zarr.codecs.ZstdCodec())
+    for array, row in (("data/img", [32, 32, 3]), ("data/action", [2])):
+        forge(path, array, shape=[10**7, *row])
+    zarr.open_array(str(path / "meta/episode_ends"), mode="r+")[:] = [6, 12, 10**7]
+    with pytest.raises(DataError, match=r"claims 30,720,000,000 bytes in \d"):
+        ZarrReplay().read(path, rate=10)
+
+
+FORGED = ("codecs", "chunk_grid")
+
+
+def test_codecs_that_are_not_read_are_named(tmp_path):
+    path, options = arrays.replay(tmp_path, PLAIN)
+    twice = CODECS["zlib"].encode(CODECS["zlib"].encode(bytes(100)))
+    replaced(path, CODECS["zlib"], twice)
+    described = json.loads((path / "data/img/.zarray").read_text())
+    for change, why in (
+        ({"filters": [{"id": "zlib"}]}, "compressed 2 times: store it with one codec"),
+        ({"compressor": {"id": "pcodec"}}, "stored by pcodec, which is not installed|is not read"),
+        ({"compressor": {"id": "imagecodecs_jpegxl"}}, "by imagecodecs_jpegxl, which is not inst"),
+    ):
+        (path / "data/img/.zarray").write_text(json.dumps(described | change))
+        with pytest.raises(DataError, match=why):
+            ZarrReplay().read(path, **options)
 
 
 @pytest.mark.parametrize("codec", ["zstd", "gzip", "bz2", "zlib", "lz4", "lzma"])
