@@ -99,12 +99,12 @@ def evaluate_run(
     """
     folder = RunFolder(run_to_write(run))
     recipe, evaluator = open_run(folder, overrides)
+    facts = run_facts(folder, recipe, evaluator)  # at once: a run that trains writes others soon
     place = data or dataset_of(folder, recipe)
     datasets = open_splits(place, evaluator.config.splits, evaluator.card)
     named = ("codec", "model", "conditioner")
     parts = {"env": evaluator.card.name, **{name: getattr(recipe, name).name for name in named}}
     published = published_for({**parts, "fraction": recipe.data["fraction"]})
-    facts = run_facts(folder, recipe, evaluator)
     if phrase := unfinished(facts):
         said = f"{folder.path} is {phrase}: these scores are of an unfinished model"
         warnings.warn(said, AcwmWarning, stacklevel=2)

@@ -35,7 +35,8 @@ class StepProgress(ProgressBar):
         """Start the bar at the step where training starts or resumes."""
         trained = sum(p.numel() for p in pl_module.parameters() if p.requires_grad)
         device = trainer.strategy.root_device.type
-        threads = f" with {torch.get_num_threads()} threads" if device == "cpu" else ""
+        count = torch.get_num_threads()
+        threads = f" with {count} thread{'s' * (count != 1)}" if device == "cpu" else ""
         step = f" from step {trainer.global_step}" if trainer.global_step else ""
         if self._shown:
             print(

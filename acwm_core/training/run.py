@@ -129,9 +129,17 @@ def read_metadata(path: Path) -> dict[str, Any]:
     Raises:
         TrainingError: the file is missing, damaged, or not written by this version of acwm.
     """
+    return _read(path)[0]
+
+
+def _read(path: Path, *, tensors: bool = False) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The metadata of a file and its tensors, of one opening: training may replace it meanwhile."""
+    weights: dict[str, Tensor] = {}
     try:
         with cast(Any, safetensors.safe_open)(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
+            if tensors:
+                weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         facts = parse_json(metadata.get("acwm", "{}"))
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         check_fetched(path)
@@ -142,7 +150,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         isinstance(known.get(name), kind) for name, kind in kinds.items()
     ):
         raise TrainingError(f"{path} was not written by this version of acwm")
-    return known
+    return known, weights
 
 
 def load_weights(world_model: WorldModel, path: Path) -> None:
@@ -153,14 +161,15 @@ def load_weights(world_model: WorldModel, path: Path) -> None:
             codec, or they do not fit the model.
         DataError: its weights are not finite.
     """
-    facts = read_metadata(path)
+    facts, stored = _read(path, tensors=True)
     own = world_model.codec.latents_fingerprint()
     if facts.get("codec") not in (None, own):
         raise TrainingError(
             f"{path} was trained on latents of another codec (fingerprint {facts['codec']}, not "
             f"{own}): restore that codec or train again"
         )
-    weights, expected = _upgraded(world_model, _stored(path, facts)), _trained(world_model)
+    _check_whole(path, facts, stored)
+    weights, expected = _upgraded(world_model, stored), _trained(world_model)
     for name in sorted({*weights, *expected}):
         shape = tuple(weights[name].shape) if name in weights else "missing"
         wanted = tuple(expected[name].shape) if name in expected else "absent"
@@ -181,7 +190,8 @@ def load_fitting_weights(world_model: WorldModel, path: Path) -> list[str]:
         TrainingError: the file is damaged, or not one of its weights fits.
         DataError: its weights are not finite.
     """
-    stored = _stored(path, read_metadata(path))
+    facts, stored = _read(path, tensors=True)
+    _check_whole(path, facts, stored)
     weights, expected = _upgraded(world_model, stored), _trained(world_model)
     fitting = {
         name: value
@@ -194,16 +204,14 @@ def load_fitting_weights(world_model: WorldModel, path: Path) -> list[str]:
     return sorted({*expected} - {*fitting})
 
 
-def _stored(path: Path, facts: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The finite weights of an undamaged file with this metadata."""
-    weights = cast(dict[str, Tensor], cast(Any, safetensors.torch).load_file(path))
+def _check_whole(path: Path, facts: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
+    """Check that the weights are finite, and those that the metadata describes."""
     if facts.get("sha256") not in (None, digest(weights)):  # None in old files
         raise TrainingError(
             f"{path} is damaged: its checksum is not the one it was written with; copy it again, "
             "or let training write it again with resume=auto"
         )
     check_finite(path, weights)
-    return weights
 
 
 def _upgraded(world_model: WorldModel, weights: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ import safetensors.torch
 import torch
 
 from acwm_core.errors import TrainingError
+from acwm_core.training import run
 from acwm_core.training.fit import fit
 from acwm_core.training.run import load_run, load_weights, read_metadata, save_weights
 from acwm_core.training.run_folder import RunFolder
@@ -48,6 +49,25 @@ def test_round_trip_of_weights(tmp_path):
     facts = read_metadata(path)
     assert len(facts.pop("sha256")) == 64
     assert facts == {"format": 1, "step": 7, "codec": there.codec.fingerprint(), "note": "x"}
+
+
+def test_weights_that_training_replaces_meanwhile_are_those_before(tmp_path, monkeypatch):
+    """An evaluation of a run that still trains called them damaged."""
+    path, back = tmp_path / "model.safetensors", tiny_world_model(seed=3)
+    models = [tiny_world_model(seed=1), tiny_world_model(seed=2)]
+
+    def save(step):
+        save_weights(path, models[step].state_dict(), back.codec.fingerprint(), step=step)
+
+    def replaced(text):
+        save(1)
+        return json.loads(text)
+
+    save(0)
+    monkeypatch.setattr(run, "parse_json", replaced)
+    load_weights(back, path)
+    for name, value in models[0].state_dict().items():
+        assert torch.equal(value, back.state_dict()[name])
 
 
 def test_the_codec_is_in_no_file_of_the_run(whole):
