@@ -324,7 +324,8 @@ def _common_clips(
         raise DataError(f"the runs predicted no clip of {split} in common: {remedy}")
     if len(common) < max(map(len, each)):
         counts = ", ".join(str(len(clips)) for clips in each)
-        only = f"only the {len(common)} clips common to all are compared"
+        are = "clip common to all is" if len(common) == 1 else "clips common to all are"
+        only = f"only the {len(common)} {are} compared"
         warnings.append(f"{split}: the runs predicted {counts} clips; {only}")
     return {label: [rows[clip] for clip in common] for label, rows in runs.items()}
 

@@ -272,8 +272,9 @@ def difference_table(runs: Sequence[EvaluatedRun]) -> Table | str:
         note = f"{info.title} {scale.unit}".strip()
         rows.append(Row(f"{each.first} → {each.second}", cells, note, strong=bool(each.winner)))
     warnings = " ".join(f"{each[:1].upper()}{each[1:]}." for each in found.warnings)
+    tests = counted(found.tests, "comparison")
     corrected = (
-        f"Paired bootstrap over episodes; p-values corrected for {found.tests} comparisons (Holm), "
+        f"Paired bootstrap over episodes; p-values corrected for {tests} (Holm), "
         "which keeps the rate of false alarms per table at 5 %. "
     )
     caption = (

@@ -113,7 +113,7 @@ class Survey:
         if not following.delay:
             return "The video follows the actions, at once"
         late = "late" if following.delay > 0 else "early"
-        return f"The video follows the actions {_frames(abs(following.delay))} {late}"
+        return f"The video follows the actions {_counted(abs(following.delay), 'frame')} {late}"
 
 
 def survey(path: str | Path) -> Survey:
@@ -159,8 +159,8 @@ def short_form(survey: Survey) -> list[str]:
     return [*lines, f"all of it, with videos: acwm data report {survey.path}"]
 
 
-def _frames(count: int) -> str:
-    return f"{count} frame" if count == 1 else f"{count} frames"
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
 def _sure(confidence: float) -> str:
@@ -196,7 +196,7 @@ def _of_following(survey: Survey) -> Iterator[Finding]:
     elif seen.delay is None:
         yield Finding("note", f"{says}: actions change too steadily")
     elif seen.confidence < SURE:
-        likely = f"{_frames(seen.delay)} in {seen.confidence:.0%} of resamples"
+        likely = f"{_counted(seen.delay, 'frame')} in {seen.confidence:.0%} of resamples"
         yield Finding("note", f"{says} ({likely}): more episodes would decide")
     elif seen.delay:
         edge = " (or more: no larger delay was tried)" if abs(seen.delay) == SHIFTS else ""
@@ -254,7 +254,7 @@ def _of_tests(lengths: dict[Split, list[int]]) -> Iterator[Finding]:
         if split != "train" and len(episodes) < MIN_EPISODES:
             yield Finding(
                 "note",
-                f"{split} has {len(episodes)} episodes: an interval and a verdict need "
+                f"{split} has {_counted(len(episodes), 'episode')}: an interval and a verdict need "
                 f"{MIN_EPISODES}. Record more, or import again with --test-episodes {MIN_EPISODES}",
             )
 
