@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,7 +74,7 @@ class Columns(NamedTuple):
 
     Attributes:
         actions: names of the columns of actions.
-        states: names of the columns of states.
+        states: the states, and the names of the columns of each.
         time: the column of times in seconds; None if there is none.
         frame: the column of numbers of frames; None if there is none.
         episode: the column that names the episode, in a table for all.
@@ -81,7 +83,7 @@ class Columns(NamedTuple):
     """
 
     actions: tuple[str, ...]
-    states: tuple[str, ...]
+    states: Mapping[str, tuple[str, ...]]
     time: str | None
     frame: str | None
     episode: str | None
@@ -128,7 +130,8 @@ class Videos(Format):
             actions: Name of the table for all episodes, or of the one in each episode's folder.
             columns: Names of the columns of actions, e.g. x,y; by default those called action…, or
                 all that hold numbers.
-            states: Names of the columns to keep as states; none by default.
+            states: Names of the columns to keep as states, or what names such as block_x, block_y
+                begin with (block), which become one; none by default.
             time: Name of the column of times.
             rate: Frames per second of folders of pictures.
             from_first_row: Whether the first row was taken with the first frame, if the clocks of
@@ -221,8 +224,8 @@ class VideoFolder:
         rate = None
         if isinstance(first, VideoFrames):
             rate = video_index(first.path).rate
-        names = self.columns.states
-        states = {name: samples(number_column(rows, name, path)[:, None]) for name in names}
+        parts = self.columns.states.items()
+        states = {name: samples(numbers(rows, names, path)) for name, names in parts}
         actions = samples(numbers(rows, self.columns.actions, path))
         others = [name for name in rows if name not in self.columns.known]
         facts = text_facts(
@@ -461,10 +464,12 @@ def _columns(
 ) -> Columns:
     """What the columns of a table are; the others have the same."""
     table = read_table(path)
-    for name in (*actions, *states, *words(time)):
+    kept = {name: _entries(table, name) or (name,) for name in states}
+    used = (*actions, *itertools.chain(*kept.values()), *words(time))
+    for name in used:
         if name not in table:
             raise DataError(f"{path} has no column {name!r}{suggest(name, table)}")
-    free = [name for name in action_columns(table) if name not in (*states, time, *actions)]
+    free = [name for name in action_columns(table) if name not in used]
     numeric = [name for name in free if holds_numbers(table[name])]
     actions = actions or tuple([name for name in numeric if is_action(name)] or numeric)
     if not actions:
@@ -472,7 +477,13 @@ def _columns(
     episode = episode_column(table) if shared else None
     time = time or special_column(table, TIMES)
     texts = tuple(name for name in free if name not in numeric)
-    return Columns(actions, states, time, special_column(table, FRAMES), episode, texts, (*table,))
+    return Columns(actions, kept, time, special_column(table, FRAMES), episode, texts, (*table,))
+
+
+def _entries(table: Table, name: str) -> tuple[str, ...]:
+    """The columns of a vector, e.g. of `block`: `block_x` and `block_y`, or `block.0` and more."""
+    entry = re.compile(rf"{re.escape(name)}[._](\d+|[wxyz])")
+    return () if name in table else tuple(each for each in table if entry.fullmatch(each))
 
 
 class UnlabelledVideos(VideoFolder):
@@ -490,7 +501,7 @@ def _without_actions(
     root: Path, places: Sequence[VideoEpisode], rate: float | None, follow_links: bool
 ) -> RecordedDataset:
     """Videos of which no actions were recorded; nothing can be trained on them as they are."""
-    columns = Columns((), (), None, None, None)
+    columns = Columns((), {}, None, None, None)
     advice = "no actions were recorded: run `acwm data label` with episodes that have some"
     return RecordedDataset(
         name=word(root),
@@ -515,9 +526,9 @@ def _facts(places: Sequence[VideoEpisode], table: Path | None) -> dict[str, Any]
 def _notes(
     root: Path, places: Sequence[VideoEpisode], path: Path, chosen: Columns
 ) -> tuple[str, ...]:
-    left = [name for name in read_table(path) if name not in {*chosen.actions, *chosen.states}]
-    special = (chosen.time, chosen.frame, chosen.episode, *chosen.texts)
-    left = [name for name in left if name not in special]
+    known = {*chosen.actions, *itertools.chain(*chosen.states.values()), *chosen.texts}
+    known |= {chosen.time, chosen.frame, chosen.episode}
+    left = [name for name in read_table(path) if name not in known]
     notes = [f"Actions are the columns {', '.join(chosen.actions)}."]
     if left:
         notes.append(f"Columns that are neither actions nor states: {', '.join(left)}.")

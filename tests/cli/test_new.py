@@ -1,17 +1,25 @@
 """`acwm new`: every kind is a package that works as it is, and is the author's own."""
 
+import ast
+import importlib
 import json
 import os
 import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 
 from acwm_core.cli import main
+from acwm_core.env.environment import ActionSpec
+from acwm_core.errors import ShapeError
+from acwm_formats.arrays import Recording, write_dataset
 from acwm_templates.kinds import KINDS
 from acwm_templates.package import package_of
 
@@ -152,3 +160,48 @@ def test_folders_and_environments_are_looked_at_first(tmp_path):
     refused = run("new", "task", "mine", "--environment", "push_cub", "--out", tmp_path / "x")
     assert "did you mean 'push_cube'?" in refused.output
     assert "'environment', 'scene'" in run("new", "car", "mine").output
+
+
+class Spots:
+    """Recordings without masks: a spot of (40, 110, 200) at positions in metres."""
+
+    def __len__(self):
+        return 1
+
+    def __getitem__(self, index):
+        frames = np.full((5, 32, 32, 3), 250, np.uint8)
+        corners = np.array([[4, 6], [20, 8], [10, 22], [16, 16], [7, 19]])
+        for frame, (x, y) in zip(frames, corners, strict=True):
+            frame[y : y + 4, x : x + 4] = (40, 110, 200)
+        places = (corners + 2 - 16) / 32 * (0.4, -0.4) + (0.1, 0.3)
+        return Recording(frames, np.zeros((4, 1)), {"position": places.astype(np.float32)})
+
+
+def write_spots(out, state):
+    action = ActionSpec(("x",), ("m",), (-1,), (1,), "delta")
+    kept = {"name": "open_drawer", "action": action, "fps": 5, "state": state, "progress": False}
+    return write_dataset(out, {"train": Spots()}, **kept).environment
+
+
+def test_an_estimator_reads_recordings_without_masks(packages, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(packages["estimator"]))
+    mine = importlib.import_module("acwm_open_drawer_estimator.open_drawer")
+    card = write_spots(tmp_path / "data", {"position": "m"})
+    mine.measure(str(tmp_path / "data"))
+    (line,) = capsys.readouterr().out.splitlines()  # no mask shows a colour
+    map_to_world = ast.literal_eval(line.removeprefix("TO_WORLD = "))
+    np.testing.assert_allclose(map_to_world, [[0.4, 0, 0.1], [0, -0.4, 0.3]], atol=0.01)
+
+    monkeypatch.setattr(mine, "TO_WORLD", map_to_world)
+    estimator = mine.OpenDrawer(card)
+    video = torch.from_numpy(Spots()[0].video).permute(0, 3, 1, 2) / 255
+    seen = estimator.read(video)
+    np.testing.assert_allclose(seen.states["position"], Spots()[0].states["position"], atol=2e-3)
+    assert not seen.masks.any()
+    assert estimator.physics.objects == ()  # masks could not tell whether one is lost
+
+    with pytest.raises(ShapeError, match="its states are none"):
+        mine.OpenDrawer(replace(card, state=()))
+    monkeypatch.setattr(mine, "COLOUR", (1.0, 0.0, 0.0))
+    with pytest.raises(SystemExit, match="COLOUR is seen in 0 of 5 frames"):
+        mine.measure(str(tmp_path / "data"))

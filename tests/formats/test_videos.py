@@ -128,6 +128,20 @@ def test_columns_by_name(tmp_path):
     assert recording.rate == 10
 
 
+def test_a_state_has_all_columns_of_its_vector(tmp_path):
+    film(tmp_path / "a.mp4", 1)
+    rows = [f"{i},{i + 0.5},{-i},{10 * i}" for i in range(8)]
+    write(tmp_path / "a.csv", "\n".join(["turn,block_x,block_y,block_size", *rows]))
+    found = Videos().read(tmp_path, states="block,block_size")
+    states = found.splits[0].states
+    place = np.arange(8.0)
+    np.testing.assert_array_equal(states["block"].values, np.stack([place + 0.5, -place], 1))
+    np.testing.assert_array_equal(states["block_size"].values, 10 * place[:, None])
+    assert found.actions.names == ("turn",)
+    with pytest.raises(DataError, match="no column 'cube'"):
+        Videos().read(tmp_path, states="cube")
+
+
 def test_what_is_called_action_is_one(tmp_path):
     film(tmp_path / "a.mp4", 0)
     np.savez(tmp_path / "a.npz", action=np.ones((8, 3)), reward=np.zeros(8))
