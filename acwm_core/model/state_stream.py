@@ -146,7 +146,7 @@ class StateStream:
         order = torch.cat([rows for rows, _ in parts]).argsort()
 
         def joined(name: str) -> Tensor | None:
-            values = [getattr(each, name) for _, each in parts]
+            values = [getattr(part, name) for _, part in parts]
             return None if values[0] is None else torch.cat(values)[order]
 
         return Conditioning(joined("modulation"), joined("context"), world.conditioner)

@@ -127,9 +127,9 @@ def _layout(
     actions: tuple[str, ...],
     states: tuple[str, ...],
 ) -> Layout:
-    seen = {path.removeprefix(OBSERVED): each for path, each in features.items()}
-    seen = {name: each for name, each in seen.items() if each.path.startswith(OBSERVED)}
-    images = {name: each for name, each in seen.items() if _shows(each)}
+    seen = {path.removeprefix(OBSERVED): feature for path, feature in features.items()}
+    seen = {name: feature for name, feature in seen.items() if feature.path.startswith(OBSERVED)}
+    images = {name: feature for name, feature in seen.items() if _shows(feature)}
     numbers = {n: f for n, f in seen.items() if f.kind == "numbers" and n not in images}
     acting = {p.removeprefix("steps/"): f for p, f in features.items() if f.kind == "numbers"}
     own = [n for n in acting if n == "action" or n.startswith("action/")]
@@ -141,11 +141,13 @@ def _layout(
         missing = "numbers in `action`: give --actions NAME" if cameras else "images to predict"
         raise DataError(f"the steps have {', '.join(seen) or 'no observation'}, and no {missing}")
     texts = {p.rpartition("/")[2]: f for p, f in features.items() if f.kind == "text"}
-    texts = {name: each for name, each in texts.items() if each.path.startswith("steps/")}
+    texts = {name: feature for name, feature in texts.items() if feature.path.startswith("steps/")}
     metadata = {p: f for p, f in features.items() if not p.startswith("steps/")}
     flagged = tuple(features[f"steps/{n}"] for n in FLAGS if f"steps/{n}" in features)
-    used = {each.path for each in (*cameras.values(), *taken, *observed.values(), *texts.values())}
-    used |= {each.path for each in flagged} | {*metadata, REWARD, "steps/discount"}
+    used = {
+        feature.path for feature in (*cameras.values(), *taken, *observed.values(), *texts.values())
+    }
+    used |= {feature.path for feature in flagged} | {*metadata, REWARD, "steps/discount"}
     others = tuple(path for path in features if path not in used)
     return Layout(cameras, taken, observed, texts, metadata, others, flagged)
 
@@ -199,7 +201,7 @@ class RLDSRecordings:
             count = _steps(layout, lists)
             notes = _checked_flags(layout, lists, count)
             actions = [f.values(lists, count).reshape(count, -1) for f in layout.actions]
-            rows = np.concatenate([each.astype(np.float64) for each in actions], 1)
+            rows = np.concatenate([columns.astype(np.float64) for columns in actions], 1)
             states = {n: Samples(f.values(lists, count)) for n, f in layout.states.items()}
             cameras = {name: self._frames(name, episode, count) for name in layout.cameras}
             facts = {"split": episode.split, **_facts(layout, lists, count)}
@@ -266,8 +268,8 @@ def _lists(path: Path, place: RecordPlace, _: str) -> Lists:
 @functools.lru_cache(maxsize=1)
 def _pixels(feature: Feature, path: Path, place: RecordPlace, stamp: str) -> NDArray[Any]:
     lists = _lists(path, place, stamp)
-    found = lists.get(feature.path, ())
-    count = len(found) if isinstance(found, list) else len(found) // int(np.prod(feature.shape))
+    values = lists.get(feature.path, ())
+    count = len(values) if isinstance(values, list) else len(values) // int(np.prod(feature.shape))
     return feature.values(lists, count)
 
 
@@ -279,12 +281,12 @@ def _steps(layout: Layout, lists: Lists) -> int:
     """
     counts: dict[str, int] = {}
     for name, feature in layout.cameras.items():
-        found = lists.get(feature.path, ())
-        plain = isinstance(found, np.ndarray)
-        counts[name] = len(found) // max(1, int(np.prod(feature.shape))) if plain else len(found)
+        values = lists.get(feature.path, ())
+        plain = isinstance(values, np.ndarray)
+        counts[name] = len(values) // max(1, int(np.prod(feature.shape))) if plain else len(values)
     if len({*counts.values()}) > 1 or not all(counts.values()):
-        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise DataError(f"its cameras have {told}, not an image for each step")
+        numbers = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise DataError(f"its cameras have {numbers}, not an image for each step")
     return next(iter(counts.values()))
 
 
@@ -327,17 +329,17 @@ def _is_dataset(folder: Path) -> bool:
 
 def _versions(path: Path) -> list[Path]:
     """The folder itself, and those of versions in it."""
-    inside = [each for each in path.glob("[0-9]*") if each.is_dir()] if path.is_dir() else []
+    inside = [folder for folder in path.glob("[0-9]*") if folder.is_dir()] if path.is_dir() else []
     return [path, *sorted(inside)]
 
 
 def _version(root: Path) -> Path:
-    found = [folder for folder in _versions(root) if _is_dataset(folder)]
-    if len(found) == 1:
-        return found[0]
-    if not found:
+    folders = [folder for folder in _versions(root) if _is_dataset(folder)]
+    if len(folders) == 1:
+        return folders[0]
+    if not folders:
         raise DataError(f"{root} has no {FEATURES} with TFRecord files")
-    raise DataError(f"{root} has several versions: name {' or '.join(map(str, found))}")
+    raise DataError(f"{root} has several versions: name {' or '.join(map(str, folders))}")
 
 
 def _shards(folder: Path) -> list[Shard]:
@@ -388,7 +390,7 @@ def _index_of(folder: Path, _: str) -> tuple[Episode, ...]:
     Raises:
         DataError: a shard is damaged, or holds another number of episodes than it should.
     """
-    claimed, found = _claimed(folder), dict[str, list[Episode]]()
+    claimed, episodes = _claimed(folder), dict[str, list[Episode]]()
     for shard in _shards(folder):
         places, said = record_places(shard.path), claimed.get(shard.split, [])
         wanted = said[shard.number] if len(said) == shard.of and shard.number < shard.of else None
@@ -396,13 +398,13 @@ def _index_of(folder: Path, _: str) -> tuple[Episode, ...]:
             raise DataError(
                 f"{shard.path} has {len(places)} episodes, but {INFO} says {wanted}: copy it again"
             )
-        inside = found.setdefault(shard.split, [])
+        inside = episodes.setdefault(shard.split, [])
         inside += [
             Episode(shard.split, len(inside) + k, shard.path, place)
             for k, place in enumerate(places)
         ]
-    order = sorted(found, key=lambda split: (split in TESTS, split != "train", split))
-    return tuple(episode for split in order for episode in found[split])
+    order = sorted(episodes, key=lambda split: (split in TESTS, split != "train", split))
+    return tuple(episode for split in order for episode in episodes[split])
 
 
 def _tests(index: Iterable[Episode]) -> Mapping[Split, Sequence[int]] | None:

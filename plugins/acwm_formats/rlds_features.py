@@ -53,12 +53,12 @@ class Feature:
         Raises:
             DataError: they are missing, or too few or too many.
         """
-        found = lists.get(self.path)
-        if self.encoding != "none" and isinstance(found, list):
-            values = [self._unpacked(each) for each in found]
+        items = lists.get(self.path)
+        if self.encoding != "none" and isinstance(items, list):
+            values = [self._unpacked(item) for item in items]
             rows = np.stack(values) if values else np.zeros((0, *self.shape), self.dtype)
-        elif isinstance(found, np.ndarray):
-            rows = found
+        elif isinstance(items, np.ndarray):
+            rows = items
         else:
             raise DataError(f"{self.path} has no numbers")
         if rows.size != count * math.prod(self.shape):
@@ -73,11 +73,11 @@ class Feature:
         Raises:
             DataError: they are missing or not in UTF-8.
         """
-        found = lists.get(self.path)
-        if not isinstance(found, list):
+        items = lists.get(self.path)
+        if not isinstance(items, list):
             raise DataError(f"{self.path} has no texts")
         try:
-            return [text.decode() for text in found]
+            return [text.decode() for text in items]
         except UnicodeDecodeError as error:
             raise DataError(f"{self.path} is no text in UTF-8") from error
 
@@ -107,7 +107,7 @@ def read_features(root: Path) -> dict[str, Feature]:
         raise DataError(f"{path} cannot be read ({error})") from error
     if isinstance(content, dict) and "content" in content and "featuresDict" not in content:
         raise DataError(f"{path} is of TensorFlow Datasets before 4.6: let a newer one write it")
-    features = {each.path: each for each in _leaves(content, "")}
+    features = {leaf.path: leaf for leaf in _leaves(content, "")}
     if not any(name.startswith("steps/") for name in features):
         raise DataError(f"{path} describes no episodes, which RLDS keeps in `steps`")
     return features
@@ -117,8 +117,8 @@ def _leaves(feature: Any, path: str) -> Iterator[Feature]:
     if not isinstance(feature, dict):
         yield Feature(path, "other")
     elif isinstance(inner := feature.get("featuresDict"), dict):
-        for name, each in dict(inner.get("features") or {}).items():
-            yield from _leaves(each, f"{path}/{name}" if path else str(name))
+        for name, part in dict(inner.get("features") or {}).items():
+            yield from _leaves(part, f"{path}/{name}" if path else str(name))
     elif path == "steps" and isinstance(inner := feature.get("sequence"), dict):
         yield from _leaves(inner.get("feature"), path)
     else:

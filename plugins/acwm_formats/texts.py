@@ -36,8 +36,8 @@ def text_fact(values: Iterable[Any]) -> Fact | None:
             return None
         if text.strip():
             texts[text] = None
-    found = list(texts)[:MOST]
-    return found[0] if len(found) == 1 else found or None
+    kept = list(texts)[:MOST]
+    return kept[0] if len(kept) == 1 else kept or None
 
 
 def text_facts(values: Mapping[str, Iterable[Any]]) -> dict[str, Fact]:

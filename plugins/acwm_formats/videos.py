@@ -285,10 +285,10 @@ class VideoFolder:
             return None
         offset = frame_times[0] - times[0] if self.from_first_row else 0.0
         rows: NDArray[np.float64] = times + offset
-        span, shown = rows[-1] - rows[0], frame_times[-1] - frame_times[0]
-        if rows[0] <= frame_times[-1] and span > (2 if counted else 10) * shown > 0:
+        span, duration = rows[-1] - rows[0], frame_times[-1] - frame_times[0]
+        if rows[0] <= frame_times[-1] and span > (2 if counted else 10) * duration > 0:
             raise DataError(
-                f"the times of {path} span {span:,.4g} s, and the video {shown:.4g} s: in "
+                f"the times of {path} span {span:,.4g} s, and the video {duration:.4g} s: in "
                 "milliseconds or nanoseconds, call their column time_ms or time_ns; if they number "
                 "frames, frame"
             )

@@ -176,10 +176,10 @@ class BodyGroup(SteppedGroup):
         return self.painter.then(self.painter.map(past, self._cells(size), size)), ()
 
     def paint(
-        self, memory: tuple[Tensor, ...], shown: Poses, size: torch.Size
+        self, memory: tuple[Tensor, ...], course: Poses, size: torch.Size
     ) -> tuple[Tensor, Tensor]:
         """What is where; see `Group.paint`."""
-        painted = self.painter.now(self.painter.map(shown, self._cells(size), size))
+        painted = self.painter.now(self.painter.map(course, self._cells(size), size))
         return painted, self.painter.vector.expand(len(painted), -1)
 
     def reading_loss(self, latents: Tensor, true: Poses) -> Tensor:

@@ -175,12 +175,12 @@ class Group(nn.Module, ABC):
         """
 
     @abstractmethod
-    def paint(self, memory: Any, shown: Any, size: torch.Size) -> tuple[Tensor, Tensor]:
+    def paint(self, memory: Any, course: Any, size: torch.Size) -> tuple[Tensor, Tensor]:
         """What its painter adds to a latent frame.
 
         Args:
             memory: what `canvas` returned.
-            shown: the course of its video frames, the last one first, `[B, stride, …]`.
+            course: the course of its video frames, the last one first, `[B, stride, …]`.
             size: rows and columns of cells.
 
         Returns:

@@ -165,9 +165,9 @@ class NodeGroup(SteppedGroup):
         looks = self.painter.looks(features, past.nodes[:, 0])
         return self.painter.then(self.painter.map(past, looks, features.shape[-2:])), looks
 
-    def paint(self, memory: Tensor, shown: Form, size: torch.Size) -> tuple[Tensor, Tensor]:
+    def paint(self, memory: Tensor, course: Form, size: torch.Size) -> tuple[Tensor, Tensor]:
         """What is where; see `Group.paint`."""
-        painted = self.painter.now(self.painter.map(shown, memory, size))
+        painted = self.painter.now(self.painter.map(course, memory, size))
         return painted, self.painter.vector.expand(len(painted), -1)
 
     @torch.no_grad()
@@ -179,15 +179,15 @@ class NodeGroup(SteppedGroup):
         if not self.training:
             return course
         wrong = [mine - true[:, 0] for mine, true in zip(read, course, strict=True)]
-        wrong = [each + SHOWN_NOISE * torch.randn_like(each[:, :1]) for each in wrong]
+        wrong = [offset + SHOWN_NOISE * torch.randn_like(offset[:, :1]) for offset in wrong]
         return Form(course.agents + wrong[0][:, None], course.nodes + wrong[1][:, None])
 
     def reading_loss(self, latents: Tensor, true: Form) -> Tensor:
         """The error of the forms from the first guess to the last one, and of the agents' cells."""
-        forms, found = self.sight.look(latents)
+        forms, logits = self.sight.look(latents)
         true = true.reversed(self._is_reversed(forms[-1], true))
-        loss = torch.stack([form_loss(each, true).mean() for each in forms]).mean()
-        return loss + FOUND * self.sight.agents.loss(found, true.agents, latents.shape[2:])
+        loss = torch.stack([form_loss(form, true).mean() for form in forms]).mean()
+        return loss + FOUND * self.sight.agents.loss(logits, true.agents, latents.shape[2:])
 
     def motion_loss(
         self, states: Tensor, actions: Tensor, random: Generator, progress: float
@@ -233,11 +233,11 @@ class NodeGroup(SteppedGroup):
     def _node_loss(self, window: Form, random: Generator) -> Tensor:
         """The error of the nodes in a window `[B, 2 + H, …]`; of draws, their energy score."""
         nodes = window.nodes
-        together, each = (
+        together, single = (
             to_device(torch.randn(shape, generator=random), nodes)
             for shape in (nodes[:, 1, :1].shape, nodes[:, 1].shape)
         )
-        begun = nodes[:, 1] + START_NOISE * (together + 0.3 * each)
+        begun = nodes[:, 1] + START_NOISE * (together + 0.3 * single)
         if not self.noise:
             moved = self._pushed(window, begun, ())
             return functional.smooth_l1_loss(moved, nodes[:, 2:], beta=0.05)

@@ -253,18 +253,18 @@ class NodeBlock(nn.Module):
         """Map features `[B, N, channels]` to features."""
         normed = self.norm(features)
         if len(shape) == 1 and not torch.is_grad_enabled():
-            heard = self._heard_along(normed)
+            messages = self._heard_along(normed)
         else:
             grid = self.hear(normed.unflatten(1, shape).movedim(-1, 1))
-            heard = grid.movedim(1, -1).flatten(1, len(shape))
-        return features + self.mix(nn.functional.silu(heard))
+            messages = grid.movedim(1, -1).flatten(1, len(shape))
+        return features + self.mix(nn.functional.silu(messages))
 
     def _heard_along(self, line: Tensor) -> Tensor:
         """What `hear` makes of a line `[B, N, channels]`, as one product: 1.4 times as fast."""
         reach, weight = self.hear.dilation[0], self.hear.weight.permute(2, 0, 1)
-        before, heard, after = nn.functional.linear(line, weight.flatten(0, 1)).chunk(3, -1)
+        before, messages, after = nn.functional.linear(line, weight.flatten(0, 1)).chunk(3, -1)
         assert self.hear.bias is not None
-        heard = heard + self.hear.bias
-        heard[:, reach:] += before[:, :-reach]
-        heard[:, :-reach] += after[:, reach:]
-        return heard
+        messages = messages + self.hear.bias
+        messages[:, reach:] += before[:, :-reach]
+        messages[:, :-reach] += after[:, reach:]
+        return messages

@@ -39,7 +39,7 @@ class PointPainter(Painter):
         apart = cells - points[:, :, None, :2]
         squares = apart.square().sum(-1)
         doubled = 2 * torch.exp(2 * self.log_widths)
-        near, far = (torch.exp(-squares / each[:, None]) for each in doubled.unbind(1))
+        near, far = (torch.exp(-squares / widths[:, None]) for widths in doubled.unbind(1))
         values = torch.cat([torch.ones_like(points[..., :1]), points[..., 2:]], -1)[..., None]
         slope = (far[..., None] * apart / WIDTHS[1]).transpose(2, 3)
         grid = torch.cat([near[:, :, None] * values, far[:, :, None] * values, slope], 2)

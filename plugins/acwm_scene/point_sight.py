@@ -64,10 +64,10 @@ class PointSight(Look):
         salience = change / (change.mean(1, keepdim=True) + 1e-6)
         logits = self.where(grid).flatten(2).float() + (salience + FLOOR).log()[:, None]
         looks = logits.softmax(-1)
-        shown = self.what(grid).unflatten(1, (self.points, self.entries)).flatten(3).float()
-        shown = torch.tanh((shown * looks[:, :, None]).sum(-1))
-        places = looks @ cells.flatten(1).t().float() + REACH * shown[..., :2]
-        return torch.cat([places, shown[..., 2:]], -1)
+        entries = self.what(grid).unflatten(1, (self.points, self.entries)).flatten(3).float()
+        entries = torch.tanh((entries * looks[:, :, None]).sum(-1))
+        places = looks @ cells.flatten(1).t().float() + REACH * entries[..., :2]
+        return torch.cat([places, entries[..., 2:]], -1)
 
 
 def cell_places(size: torch.Size | tuple[int, ...], like: Tensor) -> Tensor:

@@ -67,14 +67,18 @@ def states_with_points(model: SceneDynamics, clips: TrainingClips) -> Tensor:
     rows = torch.arange(len(clips.states)).split(READ_AT_ONCE)
     with torch.no_grad():
         return torch.cat(
-            [model.with_points(clips.states[each], clips.latents(each).float()) for each in rows]
+            [model.with_points(clips.states[part], clips.latents(part).float()) for part in rows]
         )
 
 
 def _train(model: SceneDynamics, clips: TrainingClips, steps: int, random: torch.Generator) -> None:
     matrices = model.matrices()
     numbers = {id(matrix) for matrix in matrices}
-    others = [each for each in model.parameters() if each.requires_grad and id(each) not in numbers]
+    others = [
+        parameter
+        for parameter in model.parameters()
+        if parameter.requires_grad and id(parameter) not in numbers
+    ]
     muon = Float32Muon(matrices, weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
     optimizers = [
         (AdamW(others, betas=(0.9, 0.99), weight_decay=0.01), RATE),
@@ -95,8 +99,8 @@ def pair_loss(model: SceneDynamics, clips: TrainingClips, random: torch.Generato
     frames = torch.randint(whole.shape[1], (len(rows), 1 + DRAWN), generator=random)
     frames[: len(rows) // 2, 0] = 0
     latents, states = _rearranged(model, whole, clips.states[rows], frames)
-    drawn = model.draw_true(latents[:, :1], states, _numbers(latents))
-    return functional.mse_loss(drawn, latents[:, 1:])
+    latent_frames = model.draw_true(latents[:, :1], states, _numbers(latents))
+    return functional.mse_loss(latent_frames, latents[:, 1:])
 
 
 def _rearranged(
@@ -130,13 +134,13 @@ def _measure(
     frames[:, 0] = 0
     latents, states = _rearranged(model, whole[chosen], clips.states[rows[chosen]], frames)
 
-    def drawn(states: Tensor) -> Tensor:
+    def picture_of(states: Tensor) -> Tensor:
         return model.draw_true(latents[:, :1], states, _numbers(latents))
 
-    reference, costs = drawn(states), torch.zeros_like(std)
+    reference, costs = picture_of(states), torch.zeros_like(std)
     for point, entry in np.ndindex(*std.shape):
         other = states.clone()
         column = model.columns["points"][point * std.shape[1] + entry]
         other[:, 1:, column] += PROBE * std[point, entry]
-        costs[point, entry] = (drawn(other) - reference).square().mean().sqrt()
+        costs[point, entry] = (picture_of(other) - reference).square().mean().sqrt()
     points.measure(read, costs)

@@ -162,9 +162,9 @@ class PointGroup(Group):
         given = past[:, 0]
         return self.painter.then(self.painter.map(given, features.shape[-2:])), given
 
-    def paint(self, memory: Tensor, shown: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
+    def paint(self, memory: Tensor, course: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
         """A map of the points, and a vector of them and of those in the given frame."""
-        points = shown[:, 0]
+        points = course[:, 0]
         painted = self.painter.now(self.painter.map(points, size))
         return painted, self.painter.tell(torch.cat([memory, points], 1).flatten(1))
 

@@ -260,11 +260,11 @@ class SceneDynamics(Predictor):
         whole[..., self.agent_columns(name)] = values
         return {**states, name: moved}, whole
 
-    def draw(self, scene: Scene, shown: Mapping[str, Any]) -> Tensor:
+    def draw(self, scene: Scene, courses: Mapping[str, Any]) -> Tensor:
         """The latent frame `[B, C, h, w]` of courses `[B, stride, …]`, the last frame first."""
         size = scene.base.shape[-2:]
         painted = [
-            group.paint(scene.memories[name], shown[name], size) for name, group in self._groups()
+            group.paint(scene.memories[name], courses[name], size) for name, group in self._groups()
         ]
         maps, vectors = zip(*painted, strict=True)
         return scene.base + self.drawing(

@@ -52,7 +52,9 @@ class Stage:
         Raises:
             TrainingError: the gradient stopped being finite.
         """
-        groups = [(group, rate) for each, rate in optimizers for group in each.param_groups]
+        groups = [
+            (group, rate) for optimizer, rate in optimizers for group in optimizer.param_groups
+        ]
         weights = [parameter for group, _ in groups for parameter in group["params"]]
         loss = torch.zeros(())
         bar = progress_bar(

@@ -142,10 +142,10 @@ class ValueGroup(SteppedGroup):
         given = past[:, 0]
         return self.painter.then(self.painter.map(given, features.shape[-2:])), given
 
-    def paint(self, memory: Tensor, shown: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
+    def paint(self, memory: Tensor, course: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
         """A map of the values, and a vector of them and of those in the given frame."""
-        painted = self.painter.now(self.painter.map(shown[:, 0], size))
-        return painted, self.painter.tell(torch.cat([memory, shown.flatten(1)], 1))
+        painted = self.painter.now(self.painter.map(course[:, 0], size))
+        return painted, self.painter.tell(torch.cat([memory, course.flatten(1)], 1))
 
     @torch.no_grad()
     def as_read(self, base: Tensor, course: Tensor) -> Tensor:

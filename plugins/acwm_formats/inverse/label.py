@@ -99,7 +99,7 @@ def label(
 def _check_alike(data: EpisodeDataset, labelled: EpisodeDataset) -> None:
     ours, theirs = data.card.environment, labelled.card.environment
     if ours.frame_size != theirs.frame_size or ours.views != theirs.views:
-        sizes = ["×".join(map(str, each.frame_size)) for each in (ours, theirs)]
+        sizes = ["×".join(map(str, environment.frame_size)) for environment in (ours, theirs)]
         raise DataError(
             f"{data.path} has frames of {sizes[0]}, and {labelled.path} of {sizes[1]}, or other "
             "cameras: import one of them again with the same --size and --cameras"

@@ -126,7 +126,7 @@ class ActionReader:
         for start in range(0, len(frames) - 1, BATCH):
             moments = range(start, min(start + BATCH, len(frames) - 1))
             parts.append(self._network(torch.stack([window(frames, k) for k in moments])))
-        mean, log_variance = (torch.cat(each).numpy() for each in zip(*parts, strict=True))
+        mean, log_variance = (torch.cat(rows).numpy() for rows in zip(*parts, strict=True))
         return mean, np.exp(log_variance)
 
     def _train(
@@ -161,7 +161,7 @@ class ActionReader:
         true = [(episodes.actions(index)[:-1] - self._mean) / self._std for index in held]
         estimates = [self._estimates(small(episodes.video(index))) for index in held]
         wanted = np.concatenate(true)
-        mean, variance = (np.concatenate(each) for each in zip(*estimates, strict=True))
+        mean, variance = (np.concatenate(rows) for rows in zip(*estimates, strict=True))
         squares = (wanted - mean) ** 2
         self._scale = (squares / variance).mean(0)
         confidence = self._confidence(variance)

@@ -64,7 +64,7 @@ class PolicyInputs:
     def vectors(self, now: Tensor, before: Tensor, goals: Tensor) -> Tensor:
         """The vectors `[N, size]` of states `[N, S]`, earlier ones, and goals `[N, G]`."""
         mean, std, change = (
-            torch.tensor(each, dtype=torch.float64) for each in (self.mean, self.std, self.change)
+            torch.tensor(row, dtype=torch.float64) for row in (self.mean, self.std, self.change)
         )
         values = torch.cat([now, goals], 1)
         whole = torch.cat([(values - mean) / std, (now - before) / change], 1)
@@ -191,7 +191,7 @@ class SavedPolicy:
 
 def raw_actions(scaled: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
     """Actions scaled to [-1, 1], `[…, A]`, in the units of the environment, within its bounds."""
-    least, most = (torch.tensor(each, dtype=torch.float64) for each in (low, high))
+    least, most = (torch.tensor(bounds, dtype=torch.float64) for bounds in (low, high))
     raw = least + (scaled.double().clamp(-1, 1) + 1) / 2 * (most - least)
     return raw.float().clamp(least.float(), most.float())
 
@@ -232,9 +232,9 @@ def layers_of(network: nn.Sequential) -> list[int | str]:
 def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
     """Refuse a network that does not fit what it observes or moves, by `ValueError`."""
     inputs = card.inputs
-    state, goal = (sum(map(math.prod, each.values())) for each in (inputs.state, inputs.goal))
+    state, goal = (sum(map(math.prod, shapes.values())) for shapes in (inputs.state, inputs.goal))
     sizes = len(inputs.mean), len(inputs.std), len(inputs.change)
-    linear = [each for each in network if isinstance(each, nn.Linear)]
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     ends = (linear[0].in_features, linear[-1].out_features) if linear else (0, 0)
     if sizes != (state + goal, state + goal, state) or ends != (
         inputs.size,
