@@ -99,7 +99,7 @@ class RLDS(Format):
 
 
 @dataclass(frozen=True)
-class Layout:
+class StepFeatures:
     """The features that are read, by what they are.
 
     Attributes:
@@ -126,7 +126,7 @@ def _layout(
     video: tuple[str, ...],
     actions: tuple[str, ...],
     states: tuple[str, ...],
-) -> Layout:
+) -> StepFeatures:
     seen = {path.removeprefix(OBSERVED): feature for path, feature in features.items()}
     seen = {name: feature for name, feature in seen.items() if feature.path.startswith(OBSERVED)}
     images = {name: feature for name, feature in seen.items() if _shows(feature)}
@@ -149,7 +149,7 @@ def _layout(
     }
     used |= {feature.path for feature in flagged} | {*metadata, REWARD, "steps/discount"}
     others = tuple(path for path in features if path not in used)
-    return Layout(cameras, taken, observed, texts, metadata, others, flagged)
+    return StepFeatures(cameras, taken, observed, texts, metadata, others, flagged)
 
 
 def _known(name: str, features: Mapping[str, Feature], what: str) -> str:
@@ -182,7 +182,7 @@ class RLDSRecordings:
     """The episodes of a dataset, opened on request: a record each."""
 
     root: Path
-    layout: Layout
+    layout: StepFeatures
     rate: Fraction
 
     def __len__(self) -> int:
@@ -209,7 +209,7 @@ class RLDSRecordings:
             episode.title, cameras, Samples(rows), states, self.rate, facts=facts, notes=notes
         )
 
-    def _frames(self, name: str, episode: Episode, count: int) -> ImageFrames:
+    def _frames(self, name: str, episode: EpisodeRecord, count: int) -> ImageFrames:
         images = StepImages(episode, self.layout.cameras[name], count)
         stamp = f"{episode.place} {name} {file_stamp(episode.path)}"
         return ImageFrames(images, regular_times(count, self.rate), stamp=stamp)
@@ -225,7 +225,7 @@ class Shard(NamedTuple):
     of: int
 
 
-class Episode(NamedTuple):
+class EpisodeRecord(NamedTuple):
     """Where an episode lies."""
 
     split: str
@@ -243,7 +243,7 @@ class Episode(NamedTuple):
 class StepImages:
     """The images of an episode, read from its record when they are asked for."""
 
-    episode: Episode
+    episode: EpisodeRecord
     feature: Feature
     count: int
 
@@ -273,7 +273,7 @@ def _pixels(feature: Feature, path: Path, place: RecordPlace, stamp: str) -> NDA
     return feature.values(lists, count)
 
 
-def _steps(layout: Layout, lists: Lists) -> int:
+def _steps(layout: StepFeatures, lists: Lists) -> int:
     """The number of steps of an episode, by its images.
 
     Raises:
@@ -290,7 +290,7 @@ def _steps(layout: Layout, lists: Lists) -> int:
     return next(iter(counts.values()))
 
 
-def _checked_flags(layout: Layout, lists: Lists, count: int) -> tuple[str, ...]:
+def _checked_flags(layout: StepFeatures, lists: Lists, count: int) -> tuple[str, ...]:
     """What the marks of first and last steps say.
 
     Raises:
@@ -306,7 +306,7 @@ def _checked_flags(layout: Layout, lists: Lists, count: int) -> tuple[str, ...]:
     return () if whole else ("its last step is not marked is_last, so it may have been cut off",)
 
 
-def _facts(layout: Layout, lists: Lists, count: int) -> dict[str, Any]:
+def _facts(layout: StepFeatures, lists: Lists, count: int) -> dict[str, Any]:
     """What else is known of an episode, for JSON."""
     facts: dict[str, Any] = {}
     for name, feature in (*layout.metadata.items(), *layout.texts.items()):
@@ -378,19 +378,19 @@ def _claimed(folder: Path) -> dict[str, list[int]]:
     return splits
 
 
-def _index(folder: Path) -> tuple[Episode, ...]:
+def _index(folder: Path) -> tuple[EpisodeRecord, ...]:
     stamps = [file_stamp(shard.path) for shard in _shards(folder)]
     return _index_of(folder, " ".join(stamps))
 
 
 @functools.lru_cache(maxsize=2)
-def _index_of(folder: Path, _: str) -> tuple[Episode, ...]:
+def _index_of(folder: Path, _: str) -> tuple[EpisodeRecord, ...]:
     """Where all episodes lie, training episodes first.
 
     Raises:
         DataError: a shard is damaged, or holds another number of episodes than it should.
     """
-    claimed, episodes = _claimed(folder), dict[str, list[Episode]]()
+    claimed, episodes = _claimed(folder), dict[str, list[EpisodeRecord]]()
     for shard in _shards(folder):
         places, said = record_places(shard.path), claimed.get(shard.split, [])
         wanted = said[shard.number] if len(said) == shard.of and shard.number < shard.of else None
@@ -400,21 +400,21 @@ def _index_of(folder: Path, _: str) -> tuple[Episode, ...]:
             )
         inside = episodes.setdefault(shard.split, [])
         inside += [
-            Episode(shard.split, len(inside) + k, shard.path, place)
+            EpisodeRecord(shard.split, len(inside) + k, shard.path, place)
             for k, place in enumerate(places)
         ]
     order = sorted(episodes, key=lambda split: (split in TESTS, split != "train", split))
     return tuple(episode for split in order for episode in episodes[split])
 
 
-def _tests(index: Iterable[Episode]) -> Mapping[Split, Sequence[int]] | None:
+def _tests(index: Iterable[EpisodeRecord]) -> Mapping[Split, Sequence[int]] | None:
     """The test episodes, if the splits say which."""
     places = [place for place, episode in enumerate(index) if episode.split in TESTS]
     return {"ind_test": places} if places else None
 
 
 def _notes(
-    folder: Path, features: Mapping[str, Feature], layout: Layout, shards: Sequence[Shard]
+    folder: Path, features: Mapping[str, Feature], layout: StepFeatures, shards: Sequence[Shard]
 ) -> tuple[str, ...]:
     """What people should know about how the dataset was read."""
     notes = [f"Features that were left out: {', '.join(layout.others)}."] if layout.others else []

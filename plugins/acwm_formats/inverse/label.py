@@ -18,7 +18,7 @@ from acwm_core.env.episode import Episode, EpisodeSpec, Split
 from acwm_core.env.state_field import without_dangling
 from acwm_core.errors import DataError
 from acwm_core.executors import LocalExecutor, progress_bar
-from acwm_formats.inverse.reader import ActionReader, Labels, Quality
+from acwm_formats.inverse.reader import ActionEstimates, ActionReader, Quality
 
 CONFIDENCE = "action_confidence"
 """The field of the state that holds the confidence of each action: 1 for recorded ones."""
@@ -77,7 +77,7 @@ def label(
     recorded, unlabelled = EpisodeDataset(labelled, "train"), EpisodeDataset(data, "train")
     _check_alike(unlabelled, recorded)
     reader = ActionReader(recorded, steps=steps, seed=seed, progress=progress)
-    labels: dict[int, Labels] = {}
+    labels: dict[int, ActionEstimates] = {}
     with progress_bar("labelling", len(unlabelled), shown=progress) as report:
         for index in range(len(unlabelled)):
             labels[index] = reader.read(unlabelled.video(index))
@@ -187,7 +187,7 @@ class _Source:
 
     recorded: EpisodeDataset
     unlabelled: EpisodeDataset
-    labels: Mapping[int, Labels]
+    labels: Mapping[int, ActionEstimates]
     environment: EnvironmentCard
 
     def __call__(self, specs: Sequence[EpisodeSpec]) -> Iterator[Episode]:
@@ -204,7 +204,7 @@ class _Source:
             else:
                 yield self._with(spec, self.unlabelled[order[number]], self.labels[order[number]])
 
-    def _with(self, spec: EpisodeSpec, episode: Episode, labels: Labels | None) -> Episode:
+    def _with(self, spec: EpisodeSpec, episode: Episode, labels: ActionEstimates | None) -> Episode:
         """An episode with these labels, or with the actions that were recorded."""
         actions, confidence = episode.actions, np.ones((len(episode.video), 1), np.float32)
         if labels is not None:

@@ -27,7 +27,7 @@ STILL = 1e-6
 """Deviation, as a share of the largest action, below which a dimension never changes."""
 
 
-class Labels(NamedTuple):
+class ActionEstimates(NamedTuple):
     """Actions that were read in an episode of T frames.
 
     Attributes:
@@ -109,11 +109,11 @@ class ActionReader:
         self._train(frames, actions, steps, seed, progress)
         self.quality = self._tested(episodes, held)
 
-    def read(self, video: NDArray[np.uint8]) -> Labels:
+    def read(self, video: NDArray[np.uint8]) -> ActionEstimates:
         """Read the actions of an episode `[T, 3, H, W]` uint8."""
         mean, variance = self._estimates(small(video))
         actions = np.clip(mean * self._std + self._mean, self._low, self._high)
-        return Labels(actions.astype(np.float32), self._confidence(variance))
+        return ActionEstimates(actions.astype(np.float32), self._confidence(variance))
 
     def _confidence(self, variance: Floats) -> Floats:
         shares = np.clip(1 - variance * self._scale, 0, 1)[:, self._varies]
