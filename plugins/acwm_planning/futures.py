@@ -126,6 +126,11 @@ class ModelFutures(Futures):
         latents = torch.stack(list(self._latents.values()), 1)
         return latents.detach().isfinite().flatten(1).all(1)
 
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the codec."""
+        return self._codec.latents_fingerprint()
+
     def latents(self, frames: Sequence[int]) -> Latent:
         """They carry a gradient if the predicted latents do. Each is predicted once."""
         missing = [frame for frame in frames if frame not in self._latents]

@@ -62,7 +62,8 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
     history, true, still = _solved_so_far(player, seed)
     spec, environment = player.card.action, player.environment
     candidates, chosen, values = _candidates(true, spec)
-    goal_cost = GoalCost(make_cost(player.settings), environment.task, environment.goal)
+    own = make_cost(player.settings, player.card)
+    goal_cost = GoalCost(own, environment.task, environment.goal)
     costs: dict[str, NDArray[np.float64]] = {}
     ranks: dict[str, float] = {}
     for judge in JUDGES:

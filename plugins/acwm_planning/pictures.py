@@ -95,7 +95,7 @@ class PicturePlanner:
         self.card: EnvironmentCard = bundle.card
         world = bundle.world_model.to(choose_device(device))
         self._rollouts = ModelRollouts(world, self.card, None, **settings.rollouts())
-        self._cost = make_cost(settings)
+        self._cost = make_cost(settings, self.card)
         self._controller = PlanningController(
             make_planner(settings), self._rollouts, self._cost, action_std=action_std
         )

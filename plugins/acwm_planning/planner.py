@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from acwm_core.env.card import EnvironmentCard
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Frame, Goal, Task
 from acwm_core.model.dynamics import Keypoints
@@ -49,9 +50,14 @@ class Futures(ABC):
     """Predicted futures of N candidates.
 
     `frames` are indices into the `length` planned latent frames; 0 is the next frame.
+
+    Attributes:
+        length: number of planned latent frames.
+        encoding: name of the latents, see `Codec.latents_fingerprint`; empty if it is unknown.
     """
 
     length: int
+    encoding: str = ""
 
     @abstractmethod
     def latents(self, frames: Sequence[int]) -> Latent:
@@ -92,3 +98,14 @@ class Cost(ABC):
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """Return a cost per candidate, `[N]`; lower is better, NaN is worst."""
+
+    def about(self, card: EnvironmentCard) -> Mapping[str, str]:
+        """What it depends on beside its parameters, by name; results keep and show it.
+
+        Args:
+            card: card of the environment to plan in.
+
+        Raises:
+            RecipeError: the cost is of another environment.
+        """
+        return {}

@@ -67,7 +67,22 @@ def register_costs(registry: Registry) -> None:
         summary="distance between the points that a model finds in both pictures",
     )
     registry.add(
+        "reward",
+        "acwm_planning.rewards.cost:RewardCost",
+        summary="what a learnt reward lacks of the highest recorded one: cost.head=FOLDER",
+    )
+    registry.add(
         "callable",
         "acwm_planning.costs:UserCost",
         summary="your own function: cost.function=module:name",
+    )
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    """Add `acwm train-reward`, before policies."""
+    registry.add(
+        "train-reward",
+        "acwm_planning.rewards.commands:train_reward",
+        summary="learn a reward from a recorded column, for plans and policies",
     )

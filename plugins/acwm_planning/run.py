@@ -11,7 +11,7 @@ from typing import Any
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
-from acwm_core.env.environment import Environment
+from acwm_core.env.environment import Environment, EnvironmentCard
 from acwm_core.env.task import TaskEnvironment
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
@@ -92,7 +92,7 @@ class EpisodePlayer:
         if row in ("policy", "solution"):
             return PolicyController.scripted(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulator_rollouts(row == "codec")
-        cost = make_cost(self.settings)
+        cost = make_cost(self.settings, self.card)
         return PlanningController(planner, rollouts, cost, action_std=self._action_std)
 
     def rollouts(self) -> ModelRollouts:
@@ -149,9 +149,22 @@ def make_planner(settings: Settings) -> Planner:
     return _create("planner", settings.planner, Planner)
 
 
-def make_cost(settings: Settings) -> Cost:
-    """Create the cost of these settings."""
-    return _create("cost", settings.cost, Cost)
+def make_cost(settings: Settings, card: EnvironmentCard | None = None) -> Cost:
+    """Create the cost of these settings.
+
+    Raises:
+        RecipeError: it is of another environment than that of the card.
+    """
+    cost: Cost = _create("cost", settings.cost, Cost)
+    if card is not None:
+        cost.about(card)
+    return cost
+
+
+def facts_of_cost(run: str | Path, settings: Settings) -> dict[str, str]:
+    """What the cost of these settings depends on beside its parameters; see `Cost.about`."""
+    card = DatasetCard.read(RunFolder(find_run(run)).card).environment
+    return {**make_cost(settings).about(card)}
 
 
 def _create(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:
@@ -252,7 +265,8 @@ def plan_episodes(
         "tolerance": goal_task.tolerance,
         "file_sha256": file_sha256(weights),
     }
-    results = ResumableResults(out, {**identity, **settings.to_dict()}, kind=EpisodeLine)
+    identity |= settings.to_dict() | facts_of_cost(run, settings)
+    results = ResumableResults(out, identity, kind=EpisodeLine)
     table = PlannedEpisodes(player, rows, out / VIDEOS, seeds[:videos])
 
     def write(line: Line | None = None) -> None:

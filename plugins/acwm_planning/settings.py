@@ -36,8 +36,8 @@ class Settings:
         planner: name and parameters of the planner.
         cost: name and parameters of the cost.
         past: see `ModelRollouts`.
-        state_past: as `past`, for `cost=state` with a model that carries states on; null for
-            `past`.
+        state_past: as `past`, for `cost=state` and `cost=reward` with a model that carries states
+            on; null for `past`.
         steps: see `ModelRollouts`.
         batch: see `ModelRollouts`.
         max_steps: maximum number of actions in an episode; the task's own by default.
@@ -80,7 +80,9 @@ class Settings:
 
     def rollouts(self) -> dict[str, Any]:
         """The parameters of `ModelRollouts`."""
-        reads_states = self.cost["name"] == "state" and self.cost.get("read") != "pictures"
+        reads_states = (
+            self.cost["name"] in ("state", "reward") and self.cost.get("read") != "pictures"
+        )
         state_past = self.state_past if reads_states else None
         parameters = {"past": self.past, "steps": self.steps, "batch": self.batch}
         return parameters | {"state_past": state_past}

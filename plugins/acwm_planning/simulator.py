@@ -56,6 +56,11 @@ class SimulatorFutures(Futures):
         self._observations: dict[tuple[int, ...], tuple[list[Frame], Observation]] = {}
         self._restore: Callable[[], None] | None = None
 
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the codec, if there is one."""
+        return "" if self._codec is None else self._codec.latents_fingerprint()
+
     def latents(self, frames: Sequence[int]) -> Latent:
         pictures = self._simulate(frames)[0]
         latents = torch.cat([self.still(picture) for picture in pictures])

@@ -50,7 +50,7 @@ class PlanningDriver(Driver):
         estimator = estimator_for(card) if settings.estimates else None
         rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
         self._card, self._task, self._rollouts = card, task, _InterruptibleRollouts(rollouts)
-        planner, cost = make_planner(settings), make_cost(settings)
+        planner, cost = make_planner(settings), make_cost(settings, card)
         self._controller = PlanningController(planner, self._rollouts, cost, action_std=action_std)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:

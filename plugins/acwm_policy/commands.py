@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, ExistingFolder, seeds_of
+from acwm_planning.rewards import HEAD_FILE
 
 POLICY = ExistingFolder(
     "policy's folder", "policy.safetensors", "`acwm policy train ENVIRONMENT.TASK`"
@@ -62,6 +63,11 @@ def policy() -> None:
     type=DATASET,
     help="Dataset to take them from (by default the simulator draws them), or to imitate.",
 )
+@click.option(
+    "--reward",
+    type=ExistingFolder("reward's folder", HEAD_FILE, "`acwm train-reward DATA --from COLUMN`"),
+    help="Where there is no task, reward of states to maximise (`acwm train-reward`).",
+)
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the training.")
 @click.option(
     "--out", type=OUT_FOLDER, help="The policy's folder; runs/policies/ENVIRONMENT.TASK by default."
@@ -74,8 +80,8 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     must predict states. OVERRIDES choose what learns (`acwm list learner`), and set its parameters
     by name: algorithm=sac learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
     (fields of the state) and bonus=1 (reward for success). algorithm=clone imitates the recordings
-    of --data; without a task, ENVIRONMENT alone is enough. If it is interrupted, run the same
-    command again to continue; with more --steps it trains on.
+    of --data. ENVIRONMENT alone is enough to imitate, and with a --reward. If it is interrupted,
+    run the same command again to continue; with more --steps it trains on.
     """
     from acwm_policy.settings import settings_of
 
@@ -96,7 +102,9 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     click.echo(f"{where}: {facts['steps']} steps in {facts['cpu_seconds']:.0f} s of processor time")
     if "error" in facts:
         click.echo(f"held-out actions: {facts['error']:.2f} of the error of the mean action")
-    if trained.card.task:
+    if "reward" in facts:
+        click.echo(f"error of the reward: {facts['reward']['held_out']}")
+    if trained.card.task or "reward" in facts:
         click.echo(f"next: acwm policy evaluate {where}")
 
 
@@ -154,6 +162,8 @@ def print_evaluation(found: dict[str, Any]) -> None:
         for row in found["rows"]
     ]
     title = f"{found['environment']}.{found['task']}"
+    if "held_out" in found:
+        click.echo(f"error of the reward: {found['held_out']}")
     headings = ("solved", "share, 95 %", "final distance", "p")
     print_table(Console(highlight=False, markup=False), title, headings, rows)
     gap = found["gap"]

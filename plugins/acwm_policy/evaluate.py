@@ -13,9 +13,9 @@ from torch import Tensor
 
 from acwm_core.data.shards import file_sha256
 from acwm_core.data.simulate import make_environment
-from acwm_core.env.environment import Environment
+from acwm_core.env.environment import Environment, EnvironmentCard
 from acwm_core.env.task import Goal, Task, TaskEnvironment
-from acwm_core.errors import RecipeError
+from acwm_core.errors import DataError, RecipeError
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.results import write_json
 from acwm_core.evaluation.statistics import PairedDifference, paired_bootstrap
@@ -35,6 +35,7 @@ from acwm_planning.futures import History
 from acwm_planning.left_out import LeftOut
 from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy, policy_for
 from acwm_planning.resumable import Line, ResumableResults
+from acwm_planning.rewards.task import RewardTask
 from acwm_planning.runner import EpisodeTable, play_missing
 from acwm_planning.table import EpisodeLine, summarise
 from acwm_policy.episodes import Episodes
@@ -191,13 +192,15 @@ def evaluate_policy(
             f"{bundle.card.name}"
         )
     bundle.world_model.to(choose_device(device))
-    task = load_task(bundle.card.name, policy.card.task)
+    task = task_of(policy, bundle.card)
     identity = {
         "environment": bundle.card.name,
         "task": task.name,
         "policy": file_sha256(folder / POLICY_FILE),
         "weights": file_sha256(RunFolder(find_run(model)).weights),
     }
+    if isinstance(task, RewardTask):
+        identity["reward"] = task.facts()["sha256"]
     other = None
     if beside is not None:
         other = policy_for(str(beside), bundle.card, task.name)
@@ -227,6 +230,7 @@ def _summary(
     lines = results.finished()
     return {
         **results.settings,
+        **({"held_out": task.facts()["held_out"]} if isinstance(task, RewardTask) else {}),
         "unit": task.unit,
         "tolerance": task.tolerance,
         **left.facts(),
@@ -234,6 +238,24 @@ def _summary(
         "gap": asdict(gap_of(lines)) if any(line["row"] == DREAM for line in lines) else None,
         "training": policy.card.training,
     }
+
+
+def task_of(policy: SavedPolicy, card: EnvironmentCard) -> Task:
+    """What a policy was trained for: a task, or a reward in place of one.
+
+    Raises:
+        DataError: the reward is not there, or another one by now.
+        RecipeError: it was trained for neither.
+    """
+    about = policy.card.training.get("reward")
+    if about is None:
+        if not policy.card.task:
+            raise RecipeError("the policy was trained for no task, so nothing tells if it succeeds")
+        return load_task(card.name, policy.card.task)
+    task = RewardTask.read(about["head"], card)
+    if task.facts()["sha256"] != about["sha256"]:
+        raise DataError(f"{about['head']} is not the reward that the policy was trained for")
+    return task
 
 
 def dreams(bundle: RunBundle, policy: SavedPolicy) -> bool:

@@ -25,6 +25,7 @@ from acwm_core.training.run import RunBundle
 from acwm_dream.starts import DatasetStarts, DreamStart, SimulatorStarts
 from acwm_planning.episode import load_task
 from acwm_planning.policies.saved import PolicyInputs, side_by_side
+from acwm_planning.rewards.task import RewardTask
 from acwm_policy.episodes import Episodes
 from acwm_policy.judging import judge, needs_of
 from acwm_policy.recordings import Recordings, read_recordings
@@ -99,6 +100,18 @@ def find_task(name: str, card: EnvironmentCard) -> Task:
     if environment and environment != card.name:
         raise RecipeError(f"{name} is a task of {environment}, not of {card.name}")
     return load_task(card.name, task)
+
+
+def find_reward(name: str, folder: Path, bundle: RunBundle) -> RewardTask:
+    """The task of maximising a reward in the environment of this name.
+
+    Raises:
+        DataError: there is no such reward.
+        RecipeError: the model is of another environment, or the reward cannot judge its states.
+    """
+    if name != bundle.card.name:
+        raise RecipeError(f"{name} is not {bundle.card.name}, which the model is of")
+    return RewardTask.read(folder, bundle.card)
 
 
 def begin_episodes(

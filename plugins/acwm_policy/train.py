@@ -25,8 +25,18 @@ from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.threads import use_threads
 from acwm_planning.policies.saved import PolicyCard, PolicyInputs, SavedPolicy, layers_of
+from acwm_planning.rewards.task import RewardTask
 from acwm_policy.learner import Learner
-from acwm_policy.lesson import Lesson, Measured, Place, beginnings, find_task, imitate, prepare
+from acwm_policy.lesson import (
+    Lesson,
+    Measured,
+    Place,
+    beginnings,
+    find_reward,
+    find_task,
+    imitate,
+    prepare,
+)
 from acwm_policy.settings import PolicySettings, learner_class
 
 SETTINGS_FILE, CHECKPOINT, CURVE = "settings.json", "checkpoint.pt", "curve.csv"
@@ -61,6 +71,7 @@ def train_policy(
     scenes: int | None = None,
     starts: int = 256,
     data: Path | None = None,
+    reward: Path | None = None,
     seed: int = 0,
     device: str = "auto",
     progress: bool = False,
@@ -79,6 +90,7 @@ def train_policy(
         scenes: number of scenes side by side; by default 64 in the dream and 1 in the simulator.
         starts: number of training episodes whose starts are used.
         data: dataset to take the starts from instead of the simulator, or to imitate.
+        reward: folder of a reward head, to maximise in place of a task; `task` is the environment.
         seed: of the starts, the network and the exploration.
         device: device of the model.
         progress: show a progress bar.
@@ -94,15 +106,19 @@ def train_policy(
         raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
     steps = kind.usual_steps if steps is None else steps
     if place == "recordings":
+        if reward is not None:
+            raise RecipeError(f"{settings.algorithm} imitates recordings, and maximises no reward")
         return _imitate(task, settings, out, steps, data, seed, progress)
-    if "." not in task:
-        raise RecipeError(f"{task}: give ENVIRONMENT.TASK, such as reacher.reach")
+    if ("." in task) == (reward is not None):
+        raise RecipeError(
+            f"{task}: give ENVIRONMENT.TASK, such as reacher.reach, or ENVIRONMENT and --reward"
+        )
     number = scenes or (64 if place == "dream" else 1)
     bundle, weights = load_run(run), RunFolder(find_run(run)).weights
-    goal_task = find_task(task, bundle.card)
+    asked = find_task(task, bundle.card) if reward is None else find_reward(task, reward, bundle)
     about = {
         "environment": bundle.card.name,
-        "task": goal_task.name,
+        "task": asked.name if reward is None else "",
         "model": str(run),
         "weights": file_sha256(weights),
         "place": place,
@@ -112,13 +128,15 @@ def train_policy(
         "seed": seed,
         **asdict(settings),
     }
+    if isinstance(asked, RewardTask):
+        about["reward"] = asked.facts()
     with _opened(out, about):
         use_threads(None, None, choose=True)
         bundle.world_model.to(choose_device(device))
         stored = load_checkpoint(out / CHECKPOINT)
-        begun = beginnings(bundle, goal_task, starts, data, place)
+        begun = beginnings(bundle, asked, starts, data, place)
         lesson = prepare(
-            *(bundle, goal_task, begun, place, number),
+            *(bundle, asked, begun, place, number),
             observe=settings.observe,
             bonus=settings.bonus,
             seed=seed,
@@ -265,7 +283,7 @@ class _Keeper:
         network_size = next(size for size in reversed(layers) if isinstance(size, int))
         about = PolicyCard(
             environment=card.name,
-            task=lesson.task,
+            task=str(self._about["task"]),
             repeat=lesson.repeat,
             low=[*map(float, card.action.low)],
             high=[*map(float, card.action.high)],

@@ -110,12 +110,14 @@ def plan_task(
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)
 
-    from acwm_planning.run import declared_settings, plan_episodes
+    from acwm_planning.run import declared_settings, facts_of_cost, plan_episodes
 
     declared = declared_settings(run, task)
     settings = settings_of(overrides, preset, declared)
     effective = list(words_of(settings.to_dict()))
     click.echo(f"settings: {' '.join(effective)}")
+    for name, text in facts_of_cost(run, settings).items():
+        click.echo(f"{name}: {text}")
     if other := [word for word in declared if word not in effective]:
         click.echo(f"different from the task's: {' '.join(other)}")
     where = out or run / "planning" / task

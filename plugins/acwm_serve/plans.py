@@ -66,7 +66,7 @@ class GoalPlanner:
         self._controller = PlanningController(
             make_planner(settings),
             ModelRollouts(world_model, card, reading, **settings.rollouts()),
-            make_cost(settings),
+            make_cost(settings, card),
             action_std=action_std,
         )
         self._aim: bytes | None = None
