@@ -105,21 +105,16 @@ def plan_task(
     device: str,
 ) -> None:
     """Play the episodes of a task, or draw their cost landscapes; see `plan`."""
-    from acwm_planning.settings import ROW_NAMES, settings_of, words_of
+    from acwm_planning.settings import ROW_NAMES, settings_of
 
     # reports misspelt settings and rows before the slow import of torch
     settings_of(overrides, preset).rows(rows)
 
-    from acwm_planning.run import declared_settings, facts_of_cost, plan_episodes
+    from acwm_planning.run import declared_settings, plan_episodes
 
     declared = declared_settings(run, task)
     settings = settings_of(overrides, preset, declared)
-    effective = list(words_of(settings.to_dict()))
-    click.echo(f"settings: {' '.join(effective)}")
-    for name, text in facts_of_cost(run, settings).items():
-        click.echo(f"{name}: {text}")
-    if other := [word for word in declared if word not in effective]:
-        click.echo(f"different from the task's: {' '.join(other)}")
+    show_settings(run, settings, declared)
     where = out or run / "planning" / task
     if landscape:
         draw_landscapes(run, task, settings, seeds, where, device)
@@ -154,6 +149,19 @@ def plan_task(
     click.echo(where)
 
 
+def show_settings(run: Path, settings: Settings, declared: Sequence[str]) -> None:
+    """Print the settings, what their cost depends on, and those that differ from the task's."""
+    from acwm_planning.run import facts_of_cost
+    from acwm_planning.settings import words_of
+
+    effective = list(words_of(settings.to_dict()))
+    click.echo(f"settings: {' '.join(effective)}")
+    for name, text in facts_of_cost(run, settings).items():
+        click.echo(f"{name}: {text}")
+    if other := [word for word in declared if word not in effective]:
+        click.echo(f"different from the task's: {' '.join(other)}")
+
+
 def plan_to_picture(
     run: Path,
     words: Sequence[str],
@@ -165,7 +173,7 @@ def plan_to_picture(
     device: str,
 ) -> None:
     """Make one plan to a picture, and say what it is worth."""
-    from acwm_planning.settings import settings_of, words_of
+    from acwm_planning.settings import settings_of
 
     if named := [word for word in words if "=" not in word]:
         raise click.UsageError(f"give the task {named[0]}, or --goal and --episode")
@@ -183,7 +191,7 @@ def plan_to_picture(
     bundle = load_run(run)
     own = ["cost=points"] if bundle.world_model.keypoint_names else []
     settings = settings_of(words, preset, own)
-    click.echo(f"settings: {' '.join(words_of(settings.to_dict()))}")
+    show_settings(run, settings, ())
     planner = PicturePlanner(bundle, settings, device, action_std_of(run))
     size = bundle.card.frame_size
     if start is not None:
