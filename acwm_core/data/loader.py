@@ -228,7 +228,7 @@ def _shared(batch: Any) -> Any:
         return DataError(
             f"the shared memory {SHARED}{total}, through which workers send clips, is full: start "
             "a container with --shm-size=8g, or set data.workers=0 or a smaller data.batch_size "
-            f"({str(error).splitlines()[0][:80]})"
+            f"({str(error).splitlines()[0][:160]})"
         )
     return batch
 
