@@ -81,7 +81,8 @@ def tells(name: str) -> bool:
 
 def may_tell(name: str, values: Any, count: int) -> bool:
     """Whether an array may tell episodes of `count` rows apart, by its name or by its content."""
-    is_short = values.ndim == 1 and 2 <= len(values) < count and values.dtype.kind in "iu"
+    flat = values.ndim == 1 or (values.ndim == 2 and values.shape[1] in (1, 2))
+    is_short = flat and 2 <= values.shape[0] < count and values.dtype.kind in "iu"
     return tells(name) or plain(name) in CLOCKS or is_short
 
 
@@ -102,6 +103,7 @@ def bounds_of(
     arrays = {plain(name): np.asarray(values) for name, values in candidates.items()}
     for name in [name for name in arrays if name in EDGES]:
         arrays |= _as_starts_and_ends(arrays.pop(name))
+    arrays |= {name: ends for name, v in arrays.items() if (ends := _pairs(v, count)) is not None}
     flat = {name: v for name, v in arrays.items() if v.ndim == 1 or v.shape[1:] == (1,)}
     known = {name: v.reshape(-1) for name, v in flat.items() if v.dtype.kind in "biufSUO"}
     whole = {name: v for name, v in known.items() if v.dtype.kind in "iuf" and len(v)}
@@ -129,6 +131,16 @@ def _as_starts_and_ends(edges: NDArray[Any]) -> dict[str, NDArray[Any]]:
     if edges.ndim == 1 and len(edges) > 1 and edges[0] == 0:
         return {"episode_starts": edges[:-1], "episode_ends": edges[1:]}
     return {"episode_ends": edges}
+
+
+def _pairs(values: NDArray[Any], count: int) -> NDArray[Any] | None:
+    """Where episodes end, if each of some pairs of whole numbers begins where the last one ends."""
+    if values.ndim != 2 or values.shape[1] != 2 or values.dtype.kind not in "iu" or not len(values):
+        return None
+    starts, ends = values.astype(np.int64).T
+    after = ends + (ends[-1] == count - 1)  # of the last row, or after it
+    fits = starts[0] == 0 and after[-1] == count and np.array_equal(starts[1:], after[:-1])
+    return after if fits else None
 
 
 def _edges(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:

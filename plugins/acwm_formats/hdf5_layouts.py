@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
@@ -22,7 +23,7 @@ from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, may_tell, tell
 from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.hdf5_chunks import check_chunks
 from acwm_formats.hdf5_links import check_references, external_links, open_plain
-from acwm_formats.images import CHANNELS, MOST_BYTES
+from acwm_formats.images import CHANNELS, MOST_BYTES, stacked
 from acwm_formats.names import natural
 from acwm_formats.robosuite import robosuite
 from acwm_formats.sources import files_in
@@ -170,6 +171,11 @@ def _robomimic_layout(data: Any) -> ArrayLayout | None:
     if not _is_group(first) or "obs" not in first or "actions" not in first:
         return None
     seen, length = first["obs"], len(first["actions"])
+    for name in seen:
+        if isinstance(seen[name], h5py.Dataset) and seen[name].ndim == 5:
+            raise DataError(
+                stacked(f"{seen[name].name} in {data.file.filename}", seen[name].shape[1:])
+            )
     cameras = {name: f"obs/{name}" for name in seen if is_video(seen[name])}
     states = {name: f"obs/{name}" for name in seen if is_numbers(seen[name], length)}
     libero = "bddl_file_name" in data.attrs or "problem_info" in data.attrs
@@ -218,7 +224,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
     """The episodes in the rows of a group; None if they are one.
 
     What says it may lie beside the arrays, in a group ``meta`` there, or, if the group is the only
-    one, in those above it.
+    one, in any group there, and in those above it; attributes of groups may say it, too.
 
     Args:
         group: the group.
@@ -229,8 +235,8 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
         DataError: arrays contradict each other.
     """
     for place in (group, group.parent, group.file) if alone else (group,):
-        parts = [("", place), *((name, place.get(name)) for name in INDEX)]
-        for prefix, part in parts:
+        parts = {"": place} | {name: place.get(name) for name in (place if alone else INDEX)}
+        for prefix, part in parts.items():
             if not _is_group(part):
                 continue
             arrays = {
@@ -240,6 +246,11 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
                 and item.ndim in (1, 2)
                 and may_tell(_qualified(prefix, name), item, count)
             }
+            arrays |= {
+                name: values
+                for name, value in part.attrs.items()
+                if (values := np.asarray(value)).ndim in (1, 2) and may_tell(name, values, count)
+            }
             where = f"{group.file.filename} ({', '.join(arrays)})"
             if arrays and (bounds := bounds_of(arrays, count, where, flags=alone)):
                 return bounds
@@ -248,7 +259,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
 
 def _qualified(group: str, name: str) -> str:
     """A name such as ``from`` in a group of facts about episodes is that of an episode."""
-    return name if not group or tells(name) else f"episode_{name}"
+    return name if group not in INDEX or tells(name) else f"episode_{name}"
 
 
 def is_video(item: Any) -> bool:

@@ -46,10 +46,21 @@ def channels_last(image: NDArray[Any]) -> NDArray[Any]:
     """
     if image.ndim == 2:
         return image[..., None]
+    if image.ndim == 4:
+        raise DataError(stacked("an array of five axes", image.shape))
     first, last = image.ndim == 3 and image.shape[0] in CHANNELS, image.shape[-1] in CHANNELS
     if image.ndim != 3 or first == last:
         raise DataError(f"an image is {image.shape}, not [H, W], [H, W, C] or [C, H, W]")
     return np.moveaxis(image, 0, 2) if first else image
+
+
+def stacked(what: str, shape: tuple[int, ...]) -> str:
+    """Why an array whose frames have four axes is not read."""
+    return (
+        f"{what} stacks whole episodes, or several cameras, as its frames are {list(shape)}: store "
+        "[T, H, W, C], a group or file for each episode, or all in a row with ep_len beside, and "
+        "an array per camera"
+    )
 
 
 def is_depth(image: NDArray[Any]) -> bool:

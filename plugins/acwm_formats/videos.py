@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
+from acwm_formats.episode_bounds import bounds_of, tells
 from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
@@ -253,6 +254,12 @@ class VideoFolder:
             raise DataError(
                 f"the column {column} of {path} numbers {known} episodes, but {place.name} "
                 "is one: record a video for each"
+            )
+        told = {} if self.table else {name: values for name, values in rows.items() if tells(name)}
+        if several := bounds_of(told, len(next(iter(rows.values()))), str(path)):
+            raise DataError(
+                f"{path} has {len(several)} episodes, by {', '.join(told)}, but {place.name} is "
+                "one: record a video for each"
             )
         if self.table and place.rows:
             start, stop, count = place.rows

@@ -27,10 +27,10 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout, ArrayStore, StoredEpisode, StoredEpisodes
 from acwm_formats.channels import Channels
-from acwm_formats.episode_bounds import bounds_of, tells
+from acwm_formats.episode_bounds import bounds_of, may_tell, tells
 from acwm_formats.format import Format
 from acwm_formats.frames import DENSE, MOST_FRAMES, stack_note
-from acwm_formats.images import CHANNELS, MOST_BYTES
+from acwm_formats.images import CHANNELS, MOST_BYTES, stacked
 from acwm_formats.names import exact, pair, typed, word, words
 from acwm_formats.packed import check_packed
 from acwm_formats.sources import damage_of, guarded
@@ -119,7 +119,9 @@ class ZarrReplay(Format):
         buffer = Buffer(Path(root))
         names = [name for name in buffer.names() if not tells(name)]
         arrays = {name: buffer.array(f"data/{name}") for name in names}
-        for name, array in arrays.items():
+        for name, array in sorted(arrays.items(), key=lambda item: -item[1].ndim):
+            if array.ndim == 5:
+                raise DataError(stacked(f"data/{name} of {root}", array.shape[1:]))
             if array.shape[0] != buffer.ends[-1]:
                 rows = f"{array.shape[0]} rows, but the last episode ends at {buffer.ends[-1]}"
                 raise DataError(f"data/{name} of {root} has {rows}")
@@ -291,7 +293,7 @@ class Buffer(ArrayStore):
             group: the name of the group.
         """
         with damage_of(self.path / group), _pointers_named(self.path / group):
-            arrays = self._group[group].arrays()
+            arrays = (self._group[group] if group else self._group).arrays()
             return sorted(n for n, a in arrays if a.dtype.kind in kinds and not n.startswith("."))
 
     def groups(self) -> list[str]:
@@ -389,7 +391,9 @@ class Buffer(ArrayStore):
         Raises:
             DataError: nothing says it, or what does contradicts itself.
         """
-        place = next((name for name in (*PLACES, *NUMBERED) if name in self._group), ENDS)
+        place = next((name for name in (*PLACES, *NUMBERED) if name in self._group), None)
+        if place is None:
+            return self._ends_by_content()
         if (count := self.array(place).shape[0]) > MOST_FRAMES:
             raise DataError(f"{place} of {self.path} claims {count:,} episodes")
         if place in NUMBERED:
@@ -405,6 +409,20 @@ class Buffer(ArrayStore):
         if not ends or any(end <= start for start, end in itertools.pairwise([0, *ends])):
             raise DataError(f"{ENDS} of {self.path} does not grow with each episode: {ends[:5]}")
         return ends
+
+    def _ends_by_content(self) -> list[int]:
+        """Where episodes end, by arrays of other names; raises as `ends`."""
+        groups = [f"{name}/" for name, _ in self._group.groups()]
+        names = [f"{group}{name}" for group in ("", *groups) for name in self.names(group=group)]
+        count = max((self.length(name) for name in self.names()), default=0)
+        found = {
+            n: self.array(n) for n in names if may_tell(n.rpartition("/")[2], self.array(n), count)
+        }
+        arrays = {n.rpartition("/")[2]: self._rows(n) for n, a in found.items() if a.ndim in (1, 2)}
+        bounds = bounds_of(arrays, count, str(self.path))
+        if bounds is None:
+            raise DataError(f"nothing in {self.path} says where episodes end: store {ENDS}")
+        return [stop for _, stop in bounds]
 
 
 @contextlib.contextmanager

@@ -172,6 +172,61 @@ def test_a_buffer_may_number_rows(tmp_path, place):
     assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
 
 
+ELSEWHERE = {
+    "a group of another name": {"info/n_steps": LENGTHS},
+    "ends there": {"labels/cumulative": ENDS},
+    "pairs of another name": {"spans": np.stack([STARTS, ENDS], 1)},
+    "pairs with the last row": {"spans": np.stack([STARTS, ENDS - 1], 1)},
+    "a column": {"n_steps": np.array(LENGTHS)[:, None]},
+    "limits of another name": {"cuts": np.append(0, ENDS)},
+}
+
+
+@pytest.mark.parametrize("says", ELSEWHERE.values(), ids=ELSEWHERE)
+def test_episodes_by_arrays_that_no_layout_names(tmp_path, says):
+    path = file_of(tmp_path / "all.h5", says)
+    assert are_the_four(HDF5().read(path, video="pixels", actions="action", rate=10).splits)
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    for name, values in {"data/img": frames(), "data/action": ROWS, **says}.items():
+        group.create_array(name, data=np.asarray(values))
+    assert are_the_four(ZarrReplay().read(tmp_path / "b.zarr", rate=10).splits)
+
+
+@pytest.mark.parametrize("name", ["ep_len", "horizons"])
+def test_episodes_by_attributes(tmp_path, name):
+    path = file_of(tmp_path / "all.h5", {})
+    with h5py.File(path, "a") as file:
+        file.attrs[name] = LENGTHS
+    assert are_the_four(HDF5().read(path, video="pixels", actions="action", rate=10).splits)
+
+
+def test_a_buffer_that_says_no_ends_is_refused(tmp_path):
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    for name, values in {"data/img": frames(), "data/action": ROWS}.items():
+        group.create_array(name, data=values)
+    with pytest.raises(DataError, match="says where episodes end: store meta/episode_ends"):
+        ZarrReplay().read(tmp_path / "b.zarr", rate=10)
+
+
+def test_arrays_of_five_axes_are_refused_by_what_they_are(tmp_path):
+    seen, acted = frames()[:36].reshape(3, 12, 32, 48, 3), ROWS[:36].reshape(3, 12, 2)
+    why = "stacks whole episodes, or several cameras, as its frames are"
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["pixels"], file["action"] = seen, acted
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["data/demo_0/obs/top"], file["data/demo_0/actions"] = seen, acted
+    with pytest.raises(DataError, match=why):
+        HDF5().read(tmp_path / "b.h5", rate=10)
+    recording = HDF5().read(tmp_path / "a.h5", video="pixels", actions="action", rate=10).splits[0]
+    with pytest.raises(DataError, match=why):
+        next(iter(recording.cameras["pixels"].read([0])))
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    for name, values in {"data/img": seen, "data/action": acted, "meta/ep_len": [12] * 3}.items():
+        group.create_array(name, data=np.asarray(values))
+    with pytest.raises(DataError, match=why):
+        ZarrReplay().read(tmp_path / "b.zarr", rate=10)
+
+
 def test_an_index_of_episodes_in_a_group(tmp_path):
     says = {"from": STARTS, "to": ENDS}
     path = file_of(tmp_path / "all.h5", says, beside="episode_data_index")
@@ -313,6 +368,29 @@ def test_one_video_of_several_episodes_is_refused(tmp_path, column):
     (tmp_path / "a.csv").write_text(f"{column},x\n0,1\n0,2\n0,3\n1,4\n1,5\n1,6\n")
     with pytest.raises(DataError, match=f"column {column} .* numbers 2 episodes"):
         Videos().read(tmp_path).splits[0]
+
+
+@pytest.mark.parametrize(
+    ("column", "several"),
+    [
+        ({"done": [0, 0, 1, 0, 0, 1]}, True),
+        ({"is_first": [1, 0, 0, 1, 0, 0]}, True),
+        ({"step": [0, 1, 2, 0, 1, 2]}, True),
+        ({"done": [0, 0, 0, 0, 1, 1]}, False),
+        ({"step": [0, 1, 2, 3, 4, 5]}, False),
+    ],
+)
+def test_a_table_that_ends_more_than_once_is_refused(tmp_path, column, several):
+    ((name, values),) = column.items()
+    write_clip(tmp_path / "a.mp4", range(6), at(*range(6)), 10, Clip())
+    rows = "".join(f"{value},{index}\n" for index, value in enumerate(values))
+    (tmp_path / "a.csv").write_text(f"{name},action\n{rows}")
+    found = Videos().read(tmp_path).splits
+    if not several:
+        np.testing.assert_array_equal(found[0].actions.values[:, 0], range(6))
+        return
+    with pytest.raises(DataError, match=f"has 2 episodes, by {name}, but a is one"):
+        found[0]
 
 
 def test_times_that_begin_anew_tell_episodes_apart(tmp_path):
