@@ -1,0 +1,1 @@
+"""The cart-pole of dm_control for acwm."""
