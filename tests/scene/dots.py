@@ -39,7 +39,8 @@ def learn_motion(world, states, actions, *, steps=200, clips=64, until=1.0, rate
     random = torch.Generator().manual_seed(0)
     for step in range(steps):
         rows = torch.randint(len(states), (clips,), generator=random)
-        conditioning = world.condition(actions[rows], states.shape[1])
+        length = world.codec.latent_frames(states.shape[1])
+        conditioning = world.condition(actions[rows], length)
         progress = until * step / steps
         optimizer.zero_grad()
         loss = world.model.motion_loss(states[rows], conditioning, random, progress=progress)
@@ -52,7 +53,8 @@ def learn_motion(world, states, actions, *, steps=200, clips=64, until=1.0, rate
 def follow(world, states, actions):
     """The courses of a scene that starts as the states say and follows the actions, by group."""
     model = world.model
-    embedded = model.embed(world.condition(actions, states.shape[1]))
+    length = world.codec.latent_frames(states.shape[1])
+    embedded = model.embed(world.condition(actions, length))
     courses = {}
     for name, group in model.groups.named_children():
         first = at_frame(group.encode(states[..., model.columns[name]]), 0)
