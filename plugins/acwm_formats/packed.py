@@ -49,10 +49,10 @@ def check_packed(data: bytes | memoryview, codec: str = "", most: int | None = N
     """
     room = max(LARGE, RATIO * len(data))
     limit = room if most is None else min(room, most)
-    if (told := codec or _told(data)) not in _SIZES:
+    if (kind := codec or _told(data)) not in _SIZES:
         return
     try:
-        size = _SIZES[told](data, limit)
+        size = _SIZES[kind](data, limit)
     except _DAMAGED:
         if codec:
             raise

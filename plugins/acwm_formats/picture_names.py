@@ -88,7 +88,7 @@ def _ways(folder: Path, paths: Sequence[Path]) -> tuple[list[dict[str, list[int]
 
 
 def _check_cameras(folder: Path, paths: Sequence[Path]) -> None:
-    cameras = {found[0] for path in paths if (found := re.search(CAMERA, path.stem.lower()))}
+    cameras = {match[0] for path in paths if (match := re.search(CAMERA, path.stem.lower()))}
     if len(cameras) > 1:
         raise DataError(f"{folder} has pictures of several cameras: put each into a folder")
 
@@ -118,10 +118,10 @@ def _is_anew(groups: Mapping[str, list[int]]) -> bool:
 
 def keys(path: Path) -> tuple[tuple[str, int], tuple[str, int]]:
     """What may name the episode of a picture, and the number of its frame: the last, or another."""
-    found = TWO_NUMBERS.fullmatch(path.stem)
-    if found is None:
+    match = TWO_NUMBERS.fullmatch(path.stem)
+    if match is None:
         return (path.stem, -1), (path.stem, -1)
-    before, first, between, last, end = found.groups()
+    before, first, between, last, end = match.groups()
     return (before + first + between, int(last)), (f"{before}*{between}{last}{end}", int(first))
 
 

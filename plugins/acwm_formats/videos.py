@@ -255,11 +255,13 @@ class VideoFolder:
                 f"the column {column} of {path} numbers {known} episodes, but {place.name} "
                 "is one: record a video for each"
             )
-        told = {} if self.table else {name: values for name, values in rows.items() if tells(name)}
-        if several := bounds_of(told, len(next(iter(rows.values()))), str(path)):
+        numbering = (
+            {} if self.table else {name: values for name, values in rows.items() if tells(name)}
+        )
+        if several := bounds_of(numbering, len(next(iter(rows.values()))), str(path)):
             raise DataError(
-                f"{path} has {len(several)} episodes, by {', '.join(told)}, but {place.name} is "
-                "one: record a video for each"
+                f"{path} has {len(several)} episodes, by {', '.join(numbering)}, but {place.name} "
+                "is one: record a video for each"
             )
         if self.table and place.rows:
             start, stop, count = place.rows
@@ -490,7 +492,7 @@ def _columns(
 def _entries(table: Table, name: str) -> tuple[str, ...]:
     """The columns of a vector, e.g. of `block`: `block_x` and `block_y`, or `block.0` and more."""
     entry = re.compile(rf"{re.escape(name)}[._](\d+|[wxyz])")
-    return () if name in table else tuple(each for each in table if entry.fullmatch(each))
+    return () if name in table else tuple(column for column in table if entry.fullmatch(column))
 
 
 class UnlabelledVideos(VideoFolder):

@@ -253,7 +253,7 @@ def _measured(codecs: Iterable[Any], most: int | None) -> Iterator[Any]:
     for codec in codecs:
         if hasattr(codec, "compressor"):
             packed = codec.compressor and _Measured(codec.compressor, most)
-            filters = tuple(_Measured(each, most) for each in codec.filters or ())
+            filters = tuple(_Measured(part, most) for part in codec.filters or ())
             yield replace(codec, compressor=packed, filters=filters)
             continue
         shards = hasattr(codec, "codecs")
@@ -415,10 +415,12 @@ class Buffer(ArrayStore):
         groups = [f"{name}/" for name, _ in self._group.groups()]
         names = [f"{group}{name}" for group in ("", *groups) for name in self.names(group=group)]
         count = max((self.length(name) for name in self.names()), default=0)
-        found = {
+        candidates = {
             n: self.array(n) for n in names if may_tell(n.rpartition("/")[2], self.array(n), count)
         }
-        arrays = {n.rpartition("/")[2]: self._rows(n) for n, a in found.items() if a.ndim in (1, 2)}
+        arrays = {
+            n.rpartition("/")[2]: self._rows(n) for n, a in candidates.items() if a.ndim in (1, 2)
+        }
         bounds = bounds_of(arrays, count, str(self.path))
         if bounds is None:
             raise DataError(f"nothing in {self.path} says where episodes end: store {ENDS}")

@@ -141,7 +141,7 @@ class Backprop(Learner):
 
     def _judge(self, passed: Sequence[Passed]) -> None:
         """Fit the critic to the returns of a horizon, and the averaged critic to it."""
-        aims, vectors = self._aims(passed).flatten(), torch.cat([each.vectors for each in passed])
+        aims, vectors = self._aims(passed).flatten(), torch.cat([step.vectors for step in passed])
         for _ in range(self._rounds):
             for rows in torch.randperm(len(aims), generator=self._random).chunk(4):
                 error = (self._critic(vectors[rows])[:, 0] - aims[rows]).square().mean()
@@ -158,11 +158,11 @@ class Backprop(Learner):
     def _aims(self, passed: Sequence[Passed]) -> Tensor:
         """Returns that mix all lengths (TD(λ)), `[H, n]`."""
         aims = list[Tensor]()
-        for each in reversed(passed):
-            after = self._averaged(each.last)[:, 0] * ~each.solved
+        for step in reversed(passed):
+            after = self._averaged(step.last)[:, 0] * ~step.solved
             longer = aims[-1] if aims else after
-            mixed = torch.where(each.over, after, torch.lerp(after, longer, self._lam))
-            aims.append(each.rewards + self._gamma * mixed)
+            mixed = torch.where(step.over, after, torch.lerp(after, longer, self._lam))
+            aims.append(step.rewards + self._gamma * mixed)
         return torch.stack(aims[::-1])
 
     def network(self) -> nn.Sequential:

@@ -37,8 +37,8 @@ class Glide(Scenes):
 
     def __init__(self) -> None:
         super().__init__(SCENES)
-        drawn = np.random.default_rng(0).uniform(-0.2, 0.2, (2, self.starts, 2))
-        self._begun, self._goals = drawn
+        places = np.random.default_rng(0).uniform(-0.2, 0.2, (2, self.starts, 2))
+        self._begun, self._goals = places
         self._places = torch.zeros(SCENES, 2)
 
     def begin(self, which: Sequence[int], starts: Sequence[int]) -> tuple[States, list[Goal]]:
@@ -140,7 +140,7 @@ class LearnerChecks(Suite):
         again.source.restore(stored["source"])
         expect(other.steps >= STAGE, f"after {STAGE} steps, it goes on from {other.steps}")
         other.learn(2 * STAGE, lambda _: None)
-        same = torch.equal(*(_acted(each.network(), 1.0) for each in (learner, other)))
+        same = torch.equal(*(_acted(trained.network(), 1.0) for trained in (learner, other)))
         expect(same, "a learner that goes on from a saved state learns another policy")
 
     def learns_to_come_closer(self) -> None:
@@ -162,13 +162,13 @@ class LearnerChecks(Suite):
 
 def _recorded(number: int) -> list[Recorded]:
     """Recordings of points that go straight to some place, and of what leads there."""
-    random, found = np.random.default_rng(number), list[Recorded]()
+    random, recordings = np.random.default_rng(number), list[Recorded]()
     for _ in range(number):
         begun, end = random.uniform(-0.2, 0.2, (2, 2))
         actions = np.tile((end - begun) / (12 * SPEED), (13, 1))
         states = torch.from_numpy(begun + SPEED * np.arange(13)[:, None] * actions)
-        found.append(Recorded(states, states, torch.from_numpy(actions)))
-    return found
+        recordings.append(Recorded(states, states, torch.from_numpy(actions)))
+    return recordings
 
 
 def _acted(network: nn.Sequential, spread: float) -> Tensor:

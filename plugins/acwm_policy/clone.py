@@ -62,7 +62,7 @@ class Clone(Learner):
         sizes = (self._recordings.observed, *self._widths, self._recordings.action_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            layers = [each for pair in pairwise(sizes) for each in (nn.Linear(*pair), nn.ReLU())]
+            layers = [layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), nn.ReLU())]
         self._network = nn.Sequential(*layers[:-1], nn.Tanh())
         self._random = torch.Generator().manual_seed(seed)
         self._adam = torch.optim.AdamW(

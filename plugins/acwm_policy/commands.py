@@ -133,12 +133,12 @@ def evaluate(folder: Path, **options: Any) -> None:
     """
     from acwm_policy.evaluate import evaluate_policy
 
-    found = evaluate_policy(folder, progress=True, **options)
-    print_evaluation(found)
+    results = evaluate_policy(folder, progress=True, **options)
+    print_evaluation(results)
     click.echo(options["out"] or folder / "evaluation")
 
 
-def print_evaluation(found: dict[str, Any]) -> None:
+def print_evaluation(results: dict[str, Any]) -> None:
     """Print the table of `evaluate_policy`."""
     from rich.console import Console
 
@@ -155,18 +155,18 @@ def print_evaluation(found: dict[str, Any]) -> None:
             [
                 f"{row['successes']}/{row['episodes']}",
                 share(row),
-                f"{row['distance']['value']:.3g} {found['unit']}".strip(),
+                f"{row['distance']['value']:.3g} {results['unit']}".strip(),
                 "" if row["p"] is None else f"{row['p']:.2g}",
             ],
         )
-        for row in found["rows"]
+        for row in results["rows"]
     ]
-    title = f"{found['environment']}.{found['task']}"
-    if "held_out" in found:
-        click.echo(f"error of the reward: {found['held_out']}")
+    title = f"{results['environment']}.{results['task']}"
+    if "held_out" in results:
+        click.echo(f"error of the reward: {results['held_out']}")
     headings = ("solved", "share, 95 %", "final distance", "p")
     print_table(Console(highlight=False, markup=False), title, headings, rows)
-    gap = found["gap"]
+    gap = results["gap"]
     if gap is None:
         click.echo(
             "no row in the dream: the model does not predict all that the policy observes, or "

@@ -103,8 +103,8 @@ class Episodes:
 
     def begin(self, starts: Sequence[int] | None = None) -> Tensor:
         """Begin all scenes, at these starts `[n]` or at random; what is observed, `[n, O]`."""
-        drawn = self._drawn(self.number) if starts is None else starts
-        states, self._goals = self._scenes.begin(range(self.number), drawn)
+        chosen = self._drawn(self.number) if starts is None else starts
+        states, self._goals = self._scenes.begin(range(self.number), chosen)
         self._aims = self._fields_of(self._goals)
         self._now = side_by_side(states, self._inputs.state)
         self._distance = torch.zeros_like(self._distance)
@@ -126,14 +126,14 @@ class Episodes:
         shown = {name: values.detach().numpy() for name, values in states.items()}
         counted = np.minimum(self._scenes.repeat, self._task.max_steps - self._frames)
         before = self._distance.detach().numpy()
-        found = judge(self._task, shown, self._goals, before, self._failed, counted)
-        solved = found.success & ~self._failed
-        distance = torch.from_numpy(found.distance)
+        judged = judge(self._task, shown, self._goals, before, self._failed, counted)
+        solved = judged.success & ~self._failed
+        distance = torch.from_numpy(judged.distance)
         if actions.requires_grad:
-            distance = distance + self._followed(states, shown, found.frame)
+            distance = distance + self._followed(states, shown, judged.frame)
         rewards = (self._distance - distance) / self._unit
         rewards = rewards + self._bonus * torch.from_numpy(solved)
-        self._distance, self._failed = distance, found.failed
+        self._distance, self._failed = distance, judged.failed
         self._frames = self._frames + counted
         self._returns = self._returns + rewards.detach().numpy()
         late = (self._frames >= self._task.max_steps) & ~solved
@@ -167,14 +167,14 @@ class Episodes:
     def state(self) -> dict[str, Any]:
         """Plain values by which the starts that follow can be drawn again."""
         random: dict[str, Any] = {**self._random.bit_generator.state}
-        drawn = {name: str(value) for name, value in random.pop("state").items()}
+        numbers = {name: str(value) for name, value in random.pop("state").items()}
         recent = [[int(won), value] for won, value in self.recent]
-        return {"drawn": drawn, "random": random, "recent": recent}
+        return {"drawn": numbers, "random": random, "recent": recent}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on as when `state` was called; all scenes are to begin anew."""
-        drawn = {name: int(value) for name, value in state["drawn"].items()}
-        self._random.bit_generator.state = {**state["random"], "state": drawn}
+        numbers = {name: int(value) for name, value in state["drawn"].items()}
+        self._random.bit_generator.state = {**state["random"], "state": numbers}
         self.recent.clear()
         self.recent.extend((bool(won), value) for won, value in state["recent"])
 
@@ -215,10 +215,10 @@ class Episodes:
         goals = [self._goals[row] for row in rows]
         one = {name: values[:, None] for name, values in states.items()}
         none, once = np.zeros(len(rows), np.bool_), np.ones(len(rows), np.int64)
-        found = judge(self._task, one, goals, np.full(len(rows), self._unit), none, once)
-        distance = torch.from_numpy(found.distance)
+        judged = judge(self._task, one, goals, np.full(len(rows), self._unit), none, once)
+        distance = torch.from_numpy(judged.distance)
         self._distance = self._distance.index_copy(0, torch.from_numpy(rows), distance)
-        self._failed[rows] = found.failed
+        self._failed[rows] = judged.failed
         self._frames[rows], self._returns[rows] = 0, 0.0
 
     def _fields_of(self, goals: Sequence[Goal]) -> Tensor:

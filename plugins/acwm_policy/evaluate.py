@@ -216,9 +216,9 @@ def evaluate_policy(
         with results.adding():
             label = f"evaluating at {task.name}" if progress else ""
             play_missing(table, results, seeds, progress=label)
-            found = _summary(results, task, policy, table.left)
-            write_json(where / EVALUATION_FILE, found)
-    return found
+            summary = _summary(results, task, policy, table.left)
+            write_json(where / EVALUATION_FILE, summary)
+    return summary
 
 
 def _summary(

@@ -127,7 +127,7 @@ def slopes(
         names: the fields; see `needs_of`.
     """
     fields = {name: np.asarray(states[name], np.float64) for name in names}
-    found = {name: np.zeros(values.shape) for name, values in fields.items()}
+    slopes = {name: np.zeros(values.shape) for name, values in fields.items()}
     for row, goal in enumerate(goals):
         sizes = {name: values[row].size for name, values in fields.items()}
         count, place, tried = 2 * sum(sizes.values()), 0, dict[str, NDArray[Any]]()
@@ -140,5 +140,5 @@ def slopes(
         slope = (distances[: count // 2] - distances[count // 2 :]) / (2 * DIFFERENCE)
         parts = np.split(np.nan_to_num(slope, posinf=0.0, neginf=0.0), np.cumsum([*sizes.values()]))
         for name, part in zip(sizes, parts, strict=False):
-            found[name][row] = part.reshape(found[name].shape[1:])
-    return found
+            slopes[name][row] = part.reshape(slopes[name].shape[1:])
+    return slopes

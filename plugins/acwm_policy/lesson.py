@@ -126,20 +126,20 @@ def begin_episodes(
         count: number of starts; episodes that are solved at their start are passed over.
         split: of the episodes.
     """
-    found, number = Beginnings([], []), 0
+    beginnings, number = Beginnings([], []), 0
     with closing(SimulatorStarts(card, given, task)) as simulator:
         rng = np.random.default_rng(0)  # unused, as the episode is given
-        while len(found.starts) < count:
+        while len(beginnings.starts) < count:
             spec = EpisodeSpec(card.name, split, number, options={"size": card.frame_size})
             number += 1
             try:
-                found.starts.append(simulator.draw(rng, {"spec": spec}))
+                beginnings.starts.append(simulator.draw(rng, {"spec": spec}))
             except SolvedAtStartError:
                 if number > 10 * count:
                     raise
                 continue
-            found.specs.append(spec)
-    return found
+            beginnings.specs.append(spec)
+    return beginnings
 
 
 def recorded_starts(folder: str | Path, given: int, count: int) -> Beginnings:
@@ -314,7 +314,7 @@ def measure(
 
 def usual_distance(scenes: Scenes, task: Task, goals: Sequence[Goal]) -> float:
     """The mean distance of the starts from their goals."""
-    found = list[float]()
+    distances = list[float]()
     for first in range(0, len(goals), scenes.number):
         which = range(min(scenes.number, len(goals) - first))
         states, aims = scenes.begin(which, [first + row for row in which])
@@ -322,13 +322,13 @@ def usual_distance(scenes: Scenes, task: Task, goals: Sequence[Goal]) -> float:
         count = len(which)
         unknown, once = np.full(count, np.nan), np.ones(count, np.int64)
         judged = judge(task, one, aims, unknown, np.zeros(count, np.bool_), once)
-        found += judged.distance[np.isfinite(judged.distance)].tolist()
-    if not found or not np.mean(found) > 0:
+        distances += judged.distance[np.isfinite(judged.distance)].tolist()
+    if not distances or not np.mean(distances) > 0:
         raise RecipeError(
             f"the task {task.name!r} sees no distance at the start in what the model predicts, so "
             "no policy can be trained in it"
         )
-    return float(np.mean(found))
+    return float(np.mean(distances))
 
 
 def _scale(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -70,9 +70,9 @@ class LibraryLearner(Learner):
     def parameters(cls) -> Mapping[str, Parameter]:
         taken = signature(cls.algorithm).parameters
         return {
-            each: Parameter(TYPES.get(each, type(parameter.default)), parameter.default)
-            for each, parameter in taken.items()
-            if each not in FRAMEWORK
+            name: Parameter(TYPES.get(name, type(parameter.default)), parameter.default)
+            for name, parameter in taken.items()
+            if name not in FRAMEWORK
         }
 
     @staticmethod
@@ -284,7 +284,7 @@ def network_in(policy: Any) -> nn.Sequential:
 
 def _leaves(module: nn.Module) -> Iterator[nn.Module]:
     if isinstance(module, nn.Sequential):
-        for each in module:
-            yield from _leaves(each)
+        for part in module:
+            yield from _leaves(part)
     elif not isinstance(module, nn.Identity | nn.Flatten):
         yield module

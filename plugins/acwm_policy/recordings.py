@@ -89,12 +89,12 @@ class Recordings:
 
     def draw(self, number: int, random: torch.Generator) -> Decisions:
         """So many moments, of all frames alike."""
-        drawn = torch.randint(len(self._learnt), (number,), generator=random)
-        return self._decisions(self._learnt, drawn, random)
+        places = torch.randint(len(self._learnt), (number,), generator=random)
+        return self._decisions(self._learnt, places, random)
 
-    def _decisions(self, frames: _Frames, drawn: Tensor, random: torch.Generator) -> Decisions:
+    def _decisions(self, frames: _Frames, rows: Tensor, random: torch.Generator) -> Decisions:
         """What was done in some of the frames `[N]`, each with a later one as the goal."""
-        span, (first, now, last) = self._hold * self._chunk, frames.places(drawn)
+        span, (first, now, last) = self._hold * self._chunk, frames.places(rows)
         share = torch.rand(len(now), generator=random)
         later = (now + span + (share * (last - now - span + 1)).long()).clamp(max=last)
         before = frames.states[torch.maximum(now - self._hold, first)]
@@ -129,8 +129,8 @@ class _Frames:
     """The frames of episodes one after the other, of which those with enough after them count."""
 
     def __init__(self, episodes: Sequence[Recorded], span: int) -> None:
-        long = [each for each in episodes if len(each.states) > span]
-        lengths = torch.tensor([len(each.states) for each in long], dtype=torch.int64)
+        long = [episode for episode in episodes if len(episode.states) > span]
+        lengths = torch.tensor([len(episode.states) for episode in long], dtype=torch.int64)
         self._ends, self._counted = lengths.cumsum(0), (lengths - span).cumsum(0)
         self._begun, self._span = self._ends - lengths, span
         empty = Recorded(*[torch.zeros(0, 0)] * 3)
@@ -226,12 +226,12 @@ def _recorded(
     aims: Mapping[str, list[int]],
 ) -> Recorded:
     low, high = (
-        torch.tensor(each, dtype=torch.float64) for each in (card.action.low, card.action.high)
+        torch.tensor(bound, dtype=torch.float64) for bound in (card.action.low, card.action.high)
     )
     actions = torch.from_numpy(np.array(folder.actions(number))).double()
     scaled = (2 * (actions - low) / (high - low) - 1).clamp(-1, 1)
     parts = [folder.states(number, [*names]) for names in (state, aims) if names]
-    values = [torch.from_numpy(each).double() for each in parts]
+    values = [torch.from_numpy(part).double() for part in parts]
     goals = values[1] if aims else values[0][:, :0]
     return Recorded(values[0], goals, scaled)
 
@@ -243,8 +243,8 @@ def _scaled(
     hold: int,
 ) -> PolicyInputs:
     """What is observed, with its mean and spread in the recordings."""
-    whole = torch.cat([torch.cat([each.states, each.goals], 1) for each in episodes])
-    moved = torch.cat([each.states[hold:] - each.states[:-hold] for each in episodes])
+    whole = torch.cat([torch.cat([episode.states, episode.goals], 1) for episode in episodes])
+    moved = torch.cat([episode.states[hold:] - episode.states[:-hold] for episode in episodes])
     known = [values[values.isfinite().all(1)] for values in (whole, moved)]
     if min(map(len, known)) < 2:
         raise DataError("too little is known of the recorded states to observe them")

@@ -166,7 +166,7 @@ class SimulatorScenes(Scenes):
         return stacked(states), [self._goals[start] for start in starts]
 
     def step(self, actions: NDArray[np.float32]) -> States:
-        return stacked([self._course(*each) for each in zip(self._scenes, actions, strict=True)])
+        return stacked([self._course(*pair) for pair in zip(self._scenes, actions, strict=True)])
 
     def _course(self, scene: Any, action: NDArray[np.float32]) -> States:
         states: list[States] = []
@@ -183,7 +183,7 @@ class SimulatorScenes(Scenes):
 
 def stacked(states: Sequence[States]) -> States:
     """Several states as one, along a new first axis."""
-    return {name: np.stack([np.asarray(each[name]) for each in states]) for name in states[0]}
+    return {name: np.stack([np.asarray(state[name]) for state in states]) for name in states[0]}
 
 
 def as_arrays(states: Mapping[str, Tensor]) -> States:

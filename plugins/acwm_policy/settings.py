@@ -59,10 +59,10 @@ def learner_class(name: str) -> type[Learner]:
         PluginError: it is not a `Learner`.
     """
     component = learner_component(name)
-    found = component.load()
-    if not (isinstance(found, type) and issubclass(found, Learner)):
-        raise PluginError(f"{component.part} is {found!r:.60}, which is not a Learner")
-    return cast("type[Learner]", found)
+    learner = component.load()
+    if not (isinstance(learner, type) and issubclass(learner, Learner)):
+        raise PluginError(f"{component.part} is {learner!r:.60}, which is not a Learner")
+    return cast("type[Learner]", learner)
 
 
 def settings_of(overrides: Sequence[str]) -> PolicySettings:

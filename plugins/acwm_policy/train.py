@@ -102,7 +102,7 @@ def train_policy(
     kind = learner_class(settings.algorithm)
     place = kind.places[0] if place is None else place
     if place not in kind.places:
-        known = " or ".join(PLACES[each] for each in kind.places)
+        known = " or ".join(PLACES[place] for place in kind.places)
         raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
     steps = kind.usual_steps if steps is None else steps
     if place == "recordings":
@@ -308,7 +308,7 @@ def load_checkpoint(path: Path) -> dict[str, Any] | None:
     """
     if not path.exists():
         return None
-    found: Any = load_plain(path)
-    if not isinstance(found, dict) or found.get("version") != VERSION:  # pyright: ignore
+    content: Any = load_plain(path)
+    if not isinstance(content, dict) or content.get("version") != VERSION:  # pyright: ignore
         raise DataError(f"{path} is no checkpoint of this version: delete it to begin anew")
-    return cast(dict[str, Any], found)
+    return cast(dict[str, Any], content)

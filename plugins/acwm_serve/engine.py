@@ -281,7 +281,7 @@ class Engine:
         with noting("when the model begins", *self._world.children()):
             whole = self._world.stream(video, between, steps=self._steps, seeds=seeds)
             parts = self._parted(whole, len(starts))
-        made: list[tuple[Running, Answer]] = []
+        begun: list[tuple[Running, Answer]] = []
         for row, (start, stream) in enumerate(zip(starts, parts, strict=True)):
             states = None
             if "states" in start.want:
@@ -291,8 +291,8 @@ class Engine:
             goal = None if start.goal is None else self._goal(start.goal)
             running = Running(stream, states, goal, start.want)
             now = {} if states is None else {n: v[0][None] for n, v in states.current.items()}
-            made.append((running, self._answer(running, shown, now)))
-        return made
+            begun.append((running, self._answer(running, shown, now)))
+        return begun
 
     def plan(self, requests: Sequence[PlanRequest]) -> list[Answer | AcwmError]:
         """Plan for clients, one after the other; `actions` `[N, A]` each."""
@@ -322,8 +322,8 @@ class Engine:
         videos = [step.running for step in steps]
         with noting("while the model predicts", *self._world.children()):
             frames, named = self._moved(videos, rows), self._moved_states(videos, rows)
-        each = zip(videos, frames, named, strict=True)
-        return [self._checked_answer(*facts) for facts in each]
+        parts = zip(videos, frames, named, strict=True)
+        return [self._checked_answer(*facts) for facts in parts]
 
     def _alike(self, streams: Sequence[Any]) -> list[list[int]]:
         """The places of streams that can move together."""

@@ -26,7 +26,7 @@ class Joiner:
     """
 
     def __init__(self, shared: Collection[object]) -> None:
-        self._shared = {id(each) for each in shared}
+        self._shared = {id(part) for part in shared}
         self._kept = shared  # so that no identity is given to something else
 
     def kind(self, stream: object) -> Hashable:
@@ -43,7 +43,7 @@ class Joiner:
     @torch.inference_mode()
     def joined(self, streams: Sequence[T]) -> T:
         """One stream of the clips of alike streams, in their order."""
-        parts = [self._leaves(each) for each in streams]
+        parts = [self._leaves(stream) for stream in streams]
         whole = iter([_chained(leaves) for leaves in zip(*parts, strict=True)])
         return self._walk(streams[0], lambda _: next(whole), _ignore)
 
@@ -114,13 +114,13 @@ def _with_closure(function: types.FunctionType, inside: Callable[[Any], Any]) ->
 
 def _are_generators(thing: Any) -> bool:
     several = isinstance(thing, (list, tuple)) and bool(thing)
-    return several and all(isinstance(each, torch.Generator) for each in thing)
+    return several and all(isinstance(generator, torch.Generator) for generator in thing)
 
 
 def _chained(leaves: Sequence[Any]) -> Any:
     if isinstance(leaves[0], Tensor):
         return torch.cat(list(leaves))
-    return [generator for each in leaves for generator in each]
+    return [generator for leaf in leaves for generator in leaf]
 
 
 def _ignore(_: object) -> None:

@@ -210,7 +210,7 @@ def _chained(answers: list[Answer]) -> Answer:
         if name == "keypoints":
             whole[name] = values[-1]
         elif isinstance(first, dict):
-            whole[name] = {n: np.concatenate([each[n] for each in values]) for n in first}
+            whole[name] = {n: np.concatenate([value[n] for value in values]) for n in first}
         else:
             whole[name] = np.concatenate(values)
     return whole

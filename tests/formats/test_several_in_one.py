@@ -274,7 +274,7 @@ def test_pictures_of_several_episodes_in_one_folder(tmp_path, pattern, says, tab
     assert any("4 episodes" in note for note in found.notes)
 
 
-LAST = {
+EPISODE_LAST = {
     "two numbers": "{s}_{e}.png",
     "words": "frame_{s}_ep_{e}.png",
     "a word for frames": "frame{s:04d}_{e1}.png",
@@ -282,7 +282,7 @@ LAST = {
 }
 
 
-@pytest.mark.parametrize("pattern", LAST.values(), ids=LAST)
+@pytest.mark.parametrize("pattern", EPISODE_LAST.values(), ids=LAST)
 def test_pictures_whose_episode_comes_last(tmp_path, pattern):
     pictured(tmp_path / "pixels", pattern)
     np.savez(tmp_path / "all.npz", action=ROWS)

@@ -82,9 +82,9 @@ def find_column(episodes: EpisodeDataset, name: str) -> Column:
     lists = [key for key, value in facts.items() if len(_numbers(value))]
     if name in states:
         return Column(name, True)
-    for each in (name, FACTS.get(name, "")):
-        if each in lists:
-            return Column(each, False)
+    for alias in (name, FACTS.get(name, "")):
+        if alias in lists:
+            return Column(alias, False)
     known = [*states, *lists]
     kept = f"it keeps {', '.join(known)}" if known else "import it with one among its states"
     raise DataError(

@@ -48,7 +48,7 @@ def train_reward(data: Path, column: str, states: str, out: Path | None, **optio
 
     name = DatasetCard.read(data).environment.name
     where = out or Path("runs/rewards") / name
-    names = [each.strip() for each in states.split(",") if each.strip()]
+    names = [field.strip() for field in states.split(",") if field.strip()]
     card = train(data, column, where, states=names, progress=True, **options).card
     seen = ", ".join(field.name for field in card.state) or "latents"
     click.echo(f"{where}: {card.column}, {card.worst:g} to {card.best:g}, from {seen}")

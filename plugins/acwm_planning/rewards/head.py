@@ -210,7 +210,7 @@ def scaled(inputs: Tensor, mean: list[float], std: list[float]) -> Tensor:
 def _check_sizes(card: RewardCard, network: nn.Sequential) -> None:
     """Refuse a network that does not fit what it looks at, by `ValueError`."""
     size = sum(code_size(field) * field.rows for field in card.state) or math.prod(card.latent)
-    linear = [each for each in network if isinstance(each, nn.Linear)]
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     ends = (linear[0].in_features, linear[-1].out_features) if linear else (0, 0)
     if ends != (size, 1) or len(card.input_mean) != size or len(card.input_std) != size:
         raise ValueError("its sizes do not fit each other")
