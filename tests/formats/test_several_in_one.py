@@ -282,7 +282,7 @@ EPISODE_LAST = {
 }
 
 
-@pytest.mark.parametrize("pattern", EPISODE_LAST.values(), ids=LAST)
+@pytest.mark.parametrize("pattern", EPISODE_LAST.values(), ids=EPISODE_LAST)
 def test_pictures_whose_episode_comes_last(tmp_path, pattern):
     pictured(tmp_path / "pixels", pattern)
     np.savez(tmp_path / "all.npz", action=ROWS)
