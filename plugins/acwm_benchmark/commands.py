@@ -64,7 +64,10 @@ def export(words: tuple[str, ...], out: Path, **others: Any) -> None:
     from acwm_benchmark.export import export_tasks
 
     made = export_tasks(worlds, out, overrides=overrides, **others)
-    click.echo(f"{out} holds {len(made.all)} tasks of {', '.join(made.benchmark.worlds)}")
+    count = len(made.all)
+    click.echo(
+        f"{out} holds {count} task{'s' * (count != 1)} of {', '.join(made.benchmark.worlds)}"
+    )
 
 
 @click.command()

@@ -112,7 +112,8 @@ def label_data(path: Path, labelled: Path, out: Path, **options: Any) -> None:
     halves = f"{quality.surer:.2f} where it is surer, {quality.less_sure:.2f} elsewhere"
     click.echo(f"  mean R² {quality.mean:.2f}: {halves}")
     mean = sum(done.confidence) / len(done.confidence)
-    click.echo(f"labelled {len(done.confidence)} episodes, mean confidence {mean:.2f}")
+    count = len(done.confidence)
+    click.echo(f"labelled {count} episode{'s' * (count != 1)}, mean confidence {mean:.2f}")
     if done.left_out:
         click.echo(f"left out {done.left_out} episodes of less confidence")
     click.echo(f"{out} holds {done.card.splits['train']} training episodes")
@@ -146,7 +147,7 @@ def _print_facts(facts: dict[str, Any]) -> None:
     Console(highlight=False, markup=False).print(table)
     for name, split in facts["splits"].items():
         for label, count in split.get("ood_labels", {}).items():
-            click.echo(f"{name}: {count} episodes shift {label}")
+            click.echo(f"{name}: {count} episode{'s' * (count != 1)}, shift {label}")
 
 
 def _print_notes(source: Mapping[str, Any]) -> None:
