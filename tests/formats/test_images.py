@@ -67,10 +67,15 @@ def test_depth_is_grey_between_two_distances(image):
     assert not to_rgb(unmeasured, depth_range=(0.1, 2)).any()
 
 
-@pytest.mark.parametrize("shape", [(3, 40, 3), (40, 40, 2), (2, 40, 40), (3, 40, 40, 3), (40,)])
+@pytest.mark.parametrize("shape", [(3, 40, 3), (40, 40, 2), (2, 40, 40), (40,)])
 def test_no_images(shape):
     with pytest.raises(DataError, match="an image is"):
         to_rgb(np.zeros(shape, np.uint8))
+
+
+def test_stacked_episodes_are_no_images():
+    with pytest.raises(DataError, match="five axes stacks whole episodes"):
+        to_rgb(np.zeros((3, 40, 40, 3), np.uint8))
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "CMYK", "L", "1", "I;16"])
