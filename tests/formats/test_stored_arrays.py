@@ -6,6 +6,7 @@ import pickle
 import zipfile
 import zlib
 
+import google_crc32c
 import h5py
 import numcodecs
 import numpy as np
@@ -174,10 +175,10 @@ def test_chunks_in_shards(tmp_path, compressor, codec):
     np.testing.assert_array_equal(first_frame(path, {"rate": 10}), frames[0])
     bomb = codec.encode(bytes(3 * 2**20))
     index = np.array([[place * len(bomb), len(bomb)] for place in range(6)], "<u8").tobytes()
-    check = numcodecs.CRC32C(location="end").encode(index)
+    check = index + google_crc32c.value(index).to_bytes(4, "little")
     for shard in (path / "data/img/c").rglob("*"):
         if shard.is_file():
-            shard.write_bytes(bomb * 6 + bytes(check))
+            shard.write_bytes(bomb * 6 + check)
     with pytest.raises(DataError, match="unpack to more than the 1,"):
         first_frame(path, {"rate": 10})
 
