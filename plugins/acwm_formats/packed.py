@@ -49,7 +49,7 @@ def check_packed(data: bytes | memoryview, codec: str = "", most: int | None = N
     """
     room = max(LARGE, RATIO * len(data))
     limit = room if most is None else min(room, most)
-    if (kind := codec or _told(data)) not in _SIZES:
+    if (kind := codec or _codec_of(data)) not in _SIZES:
         return
     try:
         size = _SIZES[kind](data, limit)
@@ -62,7 +62,7 @@ def check_packed(data: bytes | memoryview, codec: str = "", most: int | None = N
         raise ValueError(f"{len(data):,} bytes unpack to more than the {most:,} that belong there")
 
 
-def _told(data: bytes | memoryview) -> str:
+def _codec_of(data: bytes | memoryview) -> str:
     """The codec that the first bytes are of; empty if of none."""
     head = bytes(data[:16])
     if head[:1] == BLOSC and int.from_bytes(head[12:], "little") == len(data):

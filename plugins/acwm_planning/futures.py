@@ -127,7 +127,7 @@ class ModelFutures(Futures):
         return latents.detach().isfinite().flatten(1).all(1)
 
     @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def encoding(self) -> str:
         """That of the codec."""
         return self._codec.latents_fingerprint()
 

@@ -50,14 +50,14 @@ class Futures(ABC):
     """Predicted futures of N candidates.
 
     `frames` are indices into the `length` planned latent frames; 0 is the next frame.
-
-    Attributes:
-        length: number of planned latent frames.
-        encoding: name of the latents, see `Codec.latents_fingerprint`; empty if it is unknown.
     """
 
     length: int
-    encoding: str = ""
+
+    @property
+    def encoding(self) -> str:
+        """Name of the latents, see `Codec.latents_fingerprint`; empty if it is unknown."""
+        return ""
 
     @abstractmethod
     def latents(self, frames: Sequence[int]) -> Latent:

@@ -57,7 +57,7 @@ class SimulatorFutures(Futures):
         self._restore: Callable[[], None] | None = None
 
     @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def encoding(self) -> str:
         """That of the codec, if there is one."""
         return "" if self._codec is None else self._codec.latents_fingerprint()
 

@@ -102,7 +102,7 @@ def train_policy(
     kind = learner_class(settings.algorithm)
     place = kind.places[0] if place is None else place
     if place not in kind.places:
-        known = " or ".join(PLACES[place] for place in kind.places)
+        known = " or ".join(PLACES[choice] for choice in kind.places)
         raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
     steps = kind.usual_steps if steps is None else steps
     if place == "recordings":

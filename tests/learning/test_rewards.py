@@ -110,7 +110,7 @@ def test_a_success_is_reached_at_one_half(data, tmp_path):
 class Places(Futures):
     """Two candidates, three frames, whose latents are the places `[2, 3, 2]`."""
 
-    length = 3
+    length, encoding = 3, ""
 
     def __init__(self, places, encoding=""):
         self.places, self.encoding = places, encoding

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import safetensors
@@ -161,10 +161,7 @@ class SavedPolicy:
 
     def save(self, folder: Path) -> None:
         """Write the policy's file into a folder."""
-        weights = {name: value.contiguous() for name, value in self._network.state_dict().items()}
-        details = {"policy": json.dumps(asdict(self.card))}
-        with written_whole(folder / POLICY_FILE) as partial:
-            partial.write_bytes(safetensors.torch.save(weights, details))
+        save_network(folder / POLICY_FILE, self._network, policy=self.card)
 
     @classmethod
     def read(cls, folder: Path) -> SavedPolicy:
@@ -176,17 +173,7 @@ class SavedPolicy:
         path = folder / POLICY_FILE
         if not path.is_file():
             raise DataError(f"{folder} holds no policy: train one with `acwm policy train`")
-        check_fetched(path)
-        try:
-            with safetensors.safe_open(path, "pt") as file:
-                about: Any = (file.metadata() or {}).get("policy", "null")
-                weights: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            card: PolicyCard = typed(parse_json(about), PolicyCard)
-            network = network_of(card.layers, weights)
-            _check_sizes(card, network)
-        except (ValueError, RuntimeError, KeyError, safetensors.SafetensorError) as error:
-            raise DataError(f"{path} is no policy of this version of acwm ({error})") from error
-        return cls(card, network)
+        return cls(*read_network(path, "policy", PolicyCard, _check_sizes))
 
 
 def raw_actions(scaled: Tensor, low: Sequence[float], high: Sequence[float]) -> Tensor:
@@ -194,6 +181,56 @@ def raw_actions(scaled: Tensor, low: Sequence[float], high: Sequence[float]) -> 
     least, most = (torch.tensor(bounds, dtype=torch.float64) for bounds in (low, high))
     raw = least + (scaled.double().clamp(-1, 1) + 1) / 2 * (most - least)
     return raw.float().clamp(least.float(), most.float())
+
+
+class NetworkCard(Protocol):
+    """What a file says of the network in it."""
+
+    @property
+    def layers(self) -> list[int | str]:
+        """The network; see `PolicyCard`."""
+        ...
+
+
+Card = TypeVar("Card", bound=NetworkCard)
+
+
+def save_network(path: Path, network: nn.Module, **card: Any) -> None:
+    """Write a network in float32 into a file, with its card, a dataclass, by the card's name."""
+    state = network.state_dict().items()
+    weights = {name: value.float().contiguous() for name, value in state}
+    details = {name: json.dumps(asdict(facts)) for name, facts in card.items()}
+    with written_whole(path) as partial:
+        partial.write_bytes(safetensors.torch.save(weights, details))
+
+
+def read_network(
+    path: Path, name: str, kind: type[Card], check: Callable[[Card, nn.Sequential], None]
+) -> tuple[Card, nn.Sequential]:
+    """The card and the network of a file that `save_network` has written.
+
+    Args:
+        path: the file.
+        name: name of the card, such as ``policy``.
+        kind: class of the card.
+        check: raises ValueError for a network that does not fit its card.
+
+    Raises:
+        DataError: the file is damaged or of another version.
+    """
+    check_fetched(path)
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            about: Any = (file.metadata() or {}).get(name, "null")
+            weights: dict[str, Tensor] = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        card: Card = typed(parse_json(about), kind)
+        network = network_of(card.layers, weights)
+        check(card, network)
+    except (ValueError, RuntimeError, KeyError, safetensors.SafetensorError) as error:
+        raise DataError(
+            f"{path} is no {name.replace('_', ' ')} of this version of acwm ({error})"
+        ) from error
+    return card, network
 
 
 def network_of(layers: Sequence[int | str], weights: Mapping[str, Tensor]) -> nn.Sequential:

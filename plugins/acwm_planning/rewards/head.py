@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
@@ -19,8 +16,7 @@ from acwm_core.env.card import EnvironmentCard
 from acwm_core.env.state_field import StateField
 from acwm_core.env.states import code_size, encode
 from acwm_core.errors import DataError, RecipeError
-from acwm_core.files import check_fetched, parse_json, typed, written_whole
-from acwm_planning.policies.saved import FURTHEST, network_of
+from acwm_planning.policies.saved import FURTHEST, read_network, save_network
 from acwm_planning.rewards import HEAD_FILE
 
 
@@ -158,11 +154,7 @@ class RewardHead:
 
     def save(self, folder: Path) -> None:
         """Write the head's file into a folder."""
-        state = self.network.state_dict().items()
-        weights = {name: value.float().contiguous() for name, value in state}
-        with written_whole(folder / HEAD_FILE) as partial:
-            details = {"reward": json.dumps(asdict(self.card))}
-            partial.write_bytes(safetensors.torch.save(weights, details))
+        save_network(folder / HEAD_FILE, self.network, reward_head=self.card)
 
     @classmethod
     def read(cls, folder: str | Path) -> RewardHead:
@@ -174,17 +166,7 @@ class RewardHead:
         path = Path(folder) / HEAD_FILE
         if not path.is_file():
             raise DataError(f"{folder} holds no reward head: train one with `acwm train-reward`")
-        check_fetched(path)
-        try:
-            with safetensors.safe_open(path, "pt") as file:
-                about: Any = (file.metadata() or {}).get("reward", "null")
-                weights: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            card: RewardCard = typed(parse_json(about), RewardCard)
-            network = network_of(card.layers, weights)
-            _check_sizes(card, network)
-        except (ValueError, RuntimeError, KeyError, safetensors.SafetensorError) as error:
-            raise DataError(f"{path} is no reward head of this version ({error})") from error
-        return cls(card, network)
+        return cls(*read_network(path, "reward_head", RewardCard, _check_sizes))
 
 
 def digest_of(folder: str | Path) -> str:

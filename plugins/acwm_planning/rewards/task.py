@@ -29,11 +29,8 @@ class RewardTask(Task):
         RecipeError: the head looks at latents.
     """
 
-    name = "reward"
-    unit = ""
+    name, summary, unit = "reward", "the highest reward that was recorded", ""
     folder: Path | None = None
-
-    summary = "the highest reward that was recorded"
 
     def __init__(self, head: RewardHead, max_steps: int) -> None:
         if not head.card.state:
