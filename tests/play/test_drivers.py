@@ -127,6 +127,7 @@ def test_the_planner_plans_with_the_model_that_is_played(pool, tmp_path):
             "replay",
             "stuck",
             "throws",
+            "trained_policy",
         ]
         assert [each["name"] for each in world["tasks"]] == ["place", "place_and_turn"]
         assert (world["tasks"][0]["unit"], world["tasks"][0]["tolerance"]) == ("m", 0.015)
