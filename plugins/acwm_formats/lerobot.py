@@ -37,7 +37,10 @@ from acwm_formats.sources import damage_of, guarded
 from acwm_formats.texts import text_facts, text_note
 from acwm_formats.timeline import ActionFacts, Frames, RecordedDataset, Samples, TimedRecording
 
-FRAME, REWARD = "frame_index", "next.reward"
+FRAME = "frame_index"
+
+FACTS = {"next.reward": "rewards", "next.success": "successes"}
+"""Features that become facts of the episodes, and what these are called."""
 
 TESTS: dict[str, Split] = {
     "ind_test": "ind_test",
@@ -61,10 +64,10 @@ class LeRobot(Format):
     ) -> RecordedDataset:
         """Import the LeRobot dataset in the folder ROOT, of version 3.0, 2.1 or 2.0.
 
-        Imports the frames of one or several cameras, the actions and the observed numbers; tasks
-        and rewards are kept as facts of the episodes. The bounds of actions are the range of the
-        training episodes, since the format has none; if acwm wrote the dataset, they come from its
-        card.
+        Imports the frames of one or several cameras, the actions and the observed numbers; tasks,
+        rewards and successes are kept as facts of the episodes. The bounds of actions are the range
+        of the training episodes, since the format has none; if acwm wrote the dataset, they come
+        from its card.
 
         Args:
             root: the dataset's folder, with `meta`, `data` and `videos` in it.
@@ -84,13 +87,17 @@ class LeRobot(Format):
         ours = read_card(root)
         name = ours.name if ours else ""
         observed = [field for field in _state(features) if field.name not in acting]
-        empty = _empty(places[0], [field.name for field in observed])
+        outcomes = [name for name in FACTS if name in features and _is_numeric(features[name])]
+        empty = _empty(places[0], [*(field.name for field in observed), *outcomes])
         state = tuple(field for field in observed if field.name not in empty)
-        unused = _unused(features, (*acting, *(field.name for field in observed)))
+        unused = _unused(features, (*acting, *(field.name for field in observed), *outcomes))
         texts = [*["tasks"] * any(p.tasks for p in places), *places[0].texts, *_texts(features)]
         return RecordedDataset(
             name or word(root),
-            LeRobotRecordings(root, acting, tuple(field.name for field in state)),
+            LeRobotRecordings(
+                *(root, acting, tuple(field.name for field in state)),
+                tuple(name for name in outcomes if name not in empty),
+            ),
             {"kind": "lerobot", "name": root.resolve().name, **_facts(root, places)},
             fps=_rate(info, ours),
             tests=_tests(info, places),
@@ -136,6 +143,7 @@ class LeRobotRecordings:
     root: Path
     actions: tuple[str, ...]
     states: tuple[str, ...]
+    outcomes: tuple[str, ...]
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -149,8 +157,8 @@ class LeRobotRecordings:
     def _opened(self, index: int) -> TimedRecording:
         whole = _index(self.root)
         place = whole.places[index]
-        rewards = [REWARD] if REWARD in whole.features else []
-        names, texts = [FRAME, *self.actions, *self.states, *rewards], _texts(whole.features)
+        names = [FRAME, *self.actions, *self.states, *self.outcomes]
+        texts = _texts(whole.features)
         table = read_columns(place.data, [*names, *texts], place.episode)
         columns = {name: _numbers(table, name) for name in names}
         actions = np.concatenate([columns[name] for name in self.actions], axis=1)
@@ -158,8 +166,7 @@ class LeRobotRecordings:
         cameras = _Cameras(tuple(_cameras(whole.features)), index, self.root, numbers / whole.fps)
         facts: dict[str, Any] = {"episode": place.episode, "tasks": list(place.tasks)}
         facts |= {**place.texts, **text_facts({n: table.column(n).to_pylist() for n in texts})}
-        if rewards:
-            facts["rewards"] = columns[REWARD].reshape(-1).tolist()
+        facts |= {FACTS[name]: columns[name].reshape(-1).tolist() for name in self.outcomes}
         return TimedRecording(
             f"episode {place.episode}",
             cameras,
@@ -360,7 +367,7 @@ def _empty(place: EpisodeFiles, names: Sequence[str]) -> list[str]:
 
 
 def _unused(features: Mapping[str, Mapping[str, Any]], used: Sequence[str]) -> list[str]:
-    known = (*COLUMNS, *used, REWARD, *_cameras(features), *_texts(features))
+    known = (*COLUMNS, *used, *_cameras(features), *_texts(features))
     return [name for name in features if name not in known]
 
 

@@ -8,8 +8,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats.lerobot import LeRobot
+from acwm_planning.rewards.columns import find_column
+from acwm_planning.rewards.training import train_reward
 from tests.formats.conftest import episodes_of, imported, psnr
 from tests.formats.corpus import files
 from tests.formats.corpus.cases import Case, three
@@ -138,6 +141,45 @@ def test_a_state_that_is_null_is_left_out(root, tmp_path):
     card = imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
     assert card.environment.state == ()
     assert any("null: observation.state" in note for note in card.source["notes"])
+
+
+def outcomes(root, **columns):
+    """Give the dataset further features of one number for each row."""
+    kinds = {name.replace("_", "."): pa.array(values) for name, values in columns.items()}
+
+    def in_table(table):
+        for name, values in kinds.items():
+            table = table.append_column(name, values)
+        return table
+
+    about = {
+        name: {"dtype": "bool" if pa.types.is_boolean(values.type) else "float32", "shape": [1]}
+        for name, values in kinds.items()
+    }
+    features(root, lambda found: found.update(about))
+    rows(root, in_table)
+
+
+def test_rewards_and_successes_are_facts_of_which_a_head_is_learnt(root, tmp_path):
+    """The success is that of the rows of the file, and `--from` knows it by the file's name."""
+    solved = [t >= length - 3 for length in LENGTHS for t in range(length)]
+    outcomes(root, next_success=solved, next_reward=[float(t) for t in range(sum(LENGTHS))])
+    imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
+    episodes = EpisodeDataset(tmp_path / "data", "train")
+    kept = [episodes.about(number)["facts"] for number in range(4)]
+    assert [won for facts in kept for won in facts["successes"]] == solved
+    assert [value for facts in kept for value in facts["rewards"]] == [*range(sum(LENGTHS))]
+    head = train_reward(tmp_path / "data", "next.success", tmp_path / "head", steps=10)
+    assert (head.card.column, head.card.ahead, head.card.two_valued) == ("successes", True, True)
+    found = find_column(episodes, "next.success").rewards(episodes, 0)
+    assert found.tolist()[1:] == [*solved[: LENGTHS[0] - 2], solved[LENGTHS[0] - 1]]
+
+
+def test_a_success_that_nobody_recorded_is_named(root, tmp_path):
+    outcomes(root, next_success=pa.nulls(sum(LENGTHS), pa.bool_()))
+    card = imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
+    assert any("null: next.success" in note for note in card.source["notes"])
+    assert "successes" not in EpisodeDataset(tmp_path / "data", "train").about(0)["facts"]
 
 
 @pytest.mark.parametrize("name", ["observation.state", "action"])

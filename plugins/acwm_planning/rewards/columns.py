@@ -13,7 +13,12 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.state_field import StateField
 from acwm_core.errors import DataError, suggest
 
-FACTS = {"next.reward": "rewards", "reward": "rewards"}
+FACTS = {
+    "next.reward": "rewards",
+    "reward": "rewards",
+    "next.success": "successes",
+    "success": "successes",
+}
 """Names in sources of columns that imports keep as facts of the episodes, under another name."""
 
 _OUTCOME = re.compile(
