@@ -54,6 +54,8 @@ KEPT_TEXT = 20_000
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 """How a file begins that Git LFS puts in the place of one that it has not fetched."""
 
+_NOT_FETCHED = "is a pointer of Git LFS and not the file itself: run `git lfs pull` there"
+
 _NAME = re.compile(r"\w[\w .+-]{0,199}")
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
@@ -467,9 +469,7 @@ def check_fetched(path: Path) -> None:
     except OSError:
         return  # whoever reads it reports that
     if start == LFS_POINTER:
-        raise DataError(
-            f"{path} is a pointer of Git LFS and not the file itself: run `git lfs pull` there"
-        )
+        raise DataError(f"{path} {_NOT_FETCHED}")
 
 
 def parse_json(data: bytes | str) -> Any:
@@ -478,6 +478,7 @@ def parse_json(data: bytes | str) -> Any:
     Raises:
         ValueError: it is something else.
     """
+    _refuse_pointer(data)
     try:
         content = json.loads(data)
         _finite_json(content)
@@ -500,9 +501,17 @@ def parse_yaml(text: str, loader: Any = None) -> Any:
     import yaml
 
     loader = loader or yaml.SafeLoader
+    _refuse_pointer(text)
     if len(text) > KEPT_TEXT:
         return _parsed(text, loader)
     return copy.deepcopy(_kept(text, loader))
+
+
+def _refuse_pointer(content: bytes | str) -> None:
+    """Refuse what Git LFS puts in the place of a text; `ValueError`."""
+    start = content if isinstance(content, bytes) else content[:100].encode("utf-8", "replace")
+    if start.startswith(LFS_POINTER):
+        raise ValueError(f"it {_NOT_FETCHED}")
 
 
 @functools.lru_cache(maxsize=256)
@@ -561,6 +570,7 @@ def read_json(path: Path, kind: type[T], what: str) -> T:
         DataError: it is damaged, or of another version of acwm.
         OSError: it does not exist or cannot be read.
     """
+    check_fetched(path)
     try:
         return typed(parse_json(path.read_bytes()), kind)
     except ValueError as error:
@@ -605,6 +615,7 @@ def training_record(path: Path) -> dict[str, Any]:
             metadata: dict[str, str] = file.metadata() or {}
         return dict(parse_json(metadata.get("training", "{}")))
     except (OSError, SafetensorError, ValueError, TypeError) as error:
+        check_fetched(path)
         raise DataError(f"{path} does not say how its weights were made ({error})") from error
 
 

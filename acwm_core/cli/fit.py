@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,7 +57,8 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
         composed = _recipe_to_resume(run, words, out)
     path, make = composed.data["path"], "`acwm generate ENVIRONMENT` or `acwm data import`"
     if composed.env:
-        make = f"`acwm generate {composed.env.name} --out {path}` (for a small model, --size 64)"
+        generate = shlex.join(["acwm", "generate", composed.env.name, "--out", str(path)])
+        make = f"`{generate}` (for a small model, --size 64)"
     if isinstance(resume, Path):
         make = f"{make}, or set data.path=… to its new place"
     Dataset("dataset", "card.yaml", make).convert(path, None, None)
@@ -65,7 +67,7 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     from acwm_core.training.fit import fit as train  # last: importing torch takes seconds
 
     run = train(composed, run, resume=resume)
-    click.echo(f"trained {run}; next: acwm evaluate {run}")
+    click.echo(f"trained {run}; next: {shlex.join(['acwm', 'evaluate', str(run)])}")
 
 
 def _recipe_to_start(

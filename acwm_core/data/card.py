@@ -18,7 +18,7 @@ import yaml
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import SPLITS, EpisodeSpec, FactorSetting, Split
 from acwm_core.errors import DataError
-from acwm_core.files import check_inside, parse_yaml, typed, written_whole
+from acwm_core.files import check_fetched, check_inside, parse_yaml, typed, written_whole
 from acwm_core.recipe.recipe import flat_items
 
 CARD, MANIFEST = "card.yaml", "manifest.jsonl"
@@ -178,8 +178,9 @@ class DatasetCard:
         if not file.exists():
             raise DataError(
                 f"there is no dataset in {file.parent}: make one with "
-                f"`acwm generate ENVIRONMENT --out {file.parent}`"
+                f"`acwm generate ENVIRONMENT --out {shlex.quote(str(file.parent))}`"
             )
+        check_fetched(file)
         try:
             values = cast(dict[str, Any], parse_yaml(file.read_text(encoding="utf-8")))
             version = values["format"]

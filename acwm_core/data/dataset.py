@@ -23,7 +23,7 @@ from acwm_core.data.video import decode_into, decode_planes
 from acwm_core.env.episode import Episode, Split
 from acwm_core.env.symmetry import Symmetry
 from acwm_core.errors import DataError
-from acwm_core.files import written_whole
+from acwm_core.files import check_fetched, written_whole
 
 
 class Manifest:
@@ -49,6 +49,7 @@ class Manifest:
             try:
                 record = ShardRecord.from_json(line)
             except ValueError as error:
+                check_fetched(self.path)
                 raise DataError(
                     f"{self.path} is damaged ({error}): delete it and run the same command, which "
                     "describes the finished shards again"

@@ -18,6 +18,7 @@ import json
 import math
 import os
 import re
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -335,6 +336,6 @@ def _not_encoded(folder: LatentFolder) -> DataError:
         f"{episodes.split} of {episodes.path} is not encoded by the codec {folder.fingerprint} in "
         f"windows of {folder.frames} frames every {folder.stride}"
         f"{f', {symmetry.name}' if symmetry else ''}{known}: encode it with "
-        f"`acwm encode {episodes.path} --codec NAME --split {episodes.split} "
+        f"`acwm encode {shlex.quote(str(episodes.path))} --codec NAME --split {episodes.split} "
         f"--frames {folder.frames} --stride {folder.stride}{' --symmetries' if symmetry else ''}`"
     )

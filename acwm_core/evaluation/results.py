@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from acwm_core.evaluation.protocol import PublishedComparison
 from acwm_core.evaluation.statistics import Estimate as Estimate
 from acwm_core.evaluation.statistics import Paired as Paired
 from acwm_core.evaluation.statistics import defined as defined
-from acwm_core.files import check_inside, read_json, written_whole
+from acwm_core.files import check_fetched, check_inside, read_json, written_whole
 
 FOLDER = "evaluation"
 SUMMARY = "summary.json"
@@ -368,14 +369,16 @@ class Summary:
             DataError: the run was not evaluated, or with another version of acwm.
         """
         check_inside(run, f"{FOLDER}/**/*")
+        evaluate = shlex.join(["acwm", "evaluate", str(run)])
         try:
             return cls.load(run / FOLDER / SUMMARY)
         except (FileNotFoundError, NotADirectoryError):
             if not run.is_dir():
                 raise DataError(f"there is no run folder {run}") from None
-            raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first") from None
+            raise DataError(f"{run} was not evaluated: run `{evaluate}` first") from None
         except DataError as error:
-            raise DataError(f"{error}: run `acwm evaluate {run}` again") from None
+            check_fetched(run / FOLDER / SUMMARY)
+            raise DataError(f"{error}: run `{evaluate}` again") from None
 
     @classmethod
     def load(cls, path: Path) -> Summary:

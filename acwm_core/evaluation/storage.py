@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import shlex
 import shutil
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.config import EvaluationConfig, setting_overrides
 from acwm_core.evaluation.results import FOLDER, SUMMARY, VIDEOS, Score
-from acwm_core.files import parse_json, written_whole
+from acwm_core.files import check_fetched, parse_json, written_whole
 from acwm_core.recipe.former import current_settings
 
 pa: Any = importlib.import_module("pyarrow")  # it has no type stubs
@@ -80,7 +81,9 @@ def read_scores(run: Path) -> list[Score]:
     """Read the scores of an evaluated run; `DataError` if there are none."""
     path = result_file(run / FOLDER, EPISODES)
     if not path.exists():
-        raise DataError(f"{run} was not evaluated: run `acwm evaluate {run}` first")
+        raise DataError(
+            f"{run} was not evaluated: run `acwm evaluate {shlex.quote(str(run))}` first"
+        )
     return load_scores(path)
 
 
@@ -93,6 +96,7 @@ def load_scores(path: Path) -> list[Score]:
     except FileNotFoundError:
         raise
     except (pa.ArrowException, OSError, LookupError, TypeError, ValueError) as error:
+        check_fetched(path)
         why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise DataError(f"{path} is damaged ({why}): remove it and evaluate again") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -97,4 +98,4 @@ def score(predictions: Path, worlds: tuple[str, ...], tasks: Path, **others: Any
         click.echo(f"{world}:")
         print_summary(summary)
     where = others["out"] or f"scores/{predictions.resolve().name}"
-    click.echo(f"next: acwm report {where}/{next(iter(found))}")
+    click.echo(f"next: acwm report {shlex.quote(f'{where}/{next(iter(found))}')}")

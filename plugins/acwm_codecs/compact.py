@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from acwm_core.errors import DataError
+from acwm_core.files import check_fetched
 from acwm_core.model.codec import Codec
 from acwm_core.model.shapes import Frame, Latent, Video, check_finite
 
@@ -130,6 +131,7 @@ class Compact(Codec):
         except FileNotFoundError:
             raise DataError(f"codec '{self.name}': there is no weights file {path}") from None
         except (SafetensorError, RuntimeError) as error:
+            check_fetched(path)
             what = str(error).splitlines()[0]
             raise DataError(
                 f"codec '{self.name}': {path} does not hold its weights ({what})"

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.files import disk_error, parse_json
+from acwm_core.files import check_fetched, disk_error, parse_json
 from acwm_core.model.shapes import check_finite
 
 CONFIGURATION, TENSORS = "config.json", "diffusion_pytorch_model.safetensors"
@@ -58,6 +58,7 @@ def load_autoencoder(
     try:
         state = load_file(folder / TENSORS)
     except (OSError, ValueError, SafetensorError) as error:
+        check_fetched(folder / TENSORS)
         raise DataError(f"codec {codec!r}: {folder} cannot be read: {first_line(error)}") from None
     load_strictly(autoencoder, state, folder / TENSORS, codec)
     return autoencoder

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from acwm_codecs.pretrained import build, fingerprint, first_line, load_autoencoder, load_strictly
 from acwm_core.errors import DataError
+from acwm_core.files import check_fetched
 from acwm_core.model.codec import Codec, FrameDecoder
 from acwm_core.model.shapes import Latent, Video
 
@@ -168,8 +169,10 @@ def _load_single_file(weights: str, codec: str) -> AutoencoderKLWan:
     except KeyError as error:
         raise DataError(f"codec {codec!r}: {path} lacks {error.args[0]}") from None
     except (OSError, RuntimeError, ValueError, EOFError, SafetensorError) as error:
+        check_fetched(path)
         raise DataError(f"codec {codec!r}: {path} cannot be read: {first_line(error)}") from None
     except pickle.UnpicklingError:
+        check_fetched(path)
         raise DataError(
             f"codec {codec!r}: {path} holds something other than tensors, or nothing, and is not "
             "opened"

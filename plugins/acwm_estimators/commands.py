@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -50,4 +51,4 @@ def train_estimator(
 
     for line in train_fitted(data, out, angles, steps=steps, episodes=episodes, seed=seed):
         click.echo(line)
-    click.echo(f"wrote {out}; next: acwm new estimator NAME --weights {out}")
+    click.echo(f"wrote {out}; next: acwm new estimator NAME --weights {shlex.quote(str(out))}")

@@ -9,6 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from acwm_core.errors import DataError
+from acwm_core.files import check_fetched
 from acwm_core.model.shapes import check_finite
 from acwm_estimators.network import StateNetwork
 
@@ -27,6 +28,7 @@ def load(network: StateNetwork, path: Path) -> None:
     except FileNotFoundError:
         raise DataError(f"there is no weights file {path}") from None
     except (SafetensorError, RuntimeError) as error:
+        check_fetched(path)
         reason = str(error).splitlines()[0]
         raise DataError(f"{path} does not hold an estimator's weights ({reason})") from error
     lacking = [name for name in missing if not name.endswith("num_batches_tracked")]

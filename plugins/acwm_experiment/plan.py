@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def _dataset(file: ExperimentFile, cell: ExperimentCell, recipe: Recipe) -> Data
         return DatasetSpec(Path(path), env.name, choice)
     if not (Path(path) / CARD).is_file():
         if env:
-            make = f"acwm generate {env.name} --out {path}"
+            make = shlex.join(["acwm", "generate", env.name, "--out", path])
             raise RecipeError(f"there is no dataset in {path}: make it with `{make}`")
         raise RecipeError(
             f"{cell.title}: there is no dataset in {path}, and its recipe names no environment to "

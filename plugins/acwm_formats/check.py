@@ -19,6 +19,7 @@ from acwm_core.data.simulate import make_environment, simulate
 from acwm_core.env.card import check_episode
 from acwm_core.env.episode import Episode, Split
 from acwm_core.errors import AcwmError, DataError, expect
+from acwm_core.files import check_fetched
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ def _check_shard(path: Path, record: ShardRecord, card: DatasetCard, split: Spli
     if url and not path.exists():
         fetch_shard(f"{url}/{split}/{path.name}", path, record.sha256)
     expect(path.is_file(), "the file is missing")
+    check_fetched(path)
     expect(path.stat().st_size == record.size, f"the file does not have {record.size} bytes")
     same = file_sha256(path) == record.sha256
     expect(same, "the checksum of the file differs from the recorded one")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from types import NoneType, UnionType
@@ -313,7 +314,7 @@ def import_format(
                 f"· frames of {camera[0]}×{camera[1]} train slowly: the "
                 f"recipe small is made for --size {smaller[0]}x{smaller[1]}"
             )
-        click.echo(f"next: acwm fit small data.path={out / name}")
+        click.echo(f"next: acwm fit small {shlex.quote(f'data.path={out / name}')}")
 
 
 import_format.params += OPTIONS

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from acwm_core.errors import DataError
-from acwm_core.files import load_plain
+from acwm_core.files import check_fetched, load_plain
 from acwm_core.model.shapes import check_finite
 
 
@@ -24,6 +24,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         try:
             tensors = load_file(path)
         except SafetensorError as error:
+            check_fetched(path)
             raise DataError(f"{path} is damaged ({error})") from error
         check_finite(path, tensors)
         return tensors

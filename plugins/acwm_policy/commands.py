@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     if "reward" in facts:
         click.echo(f"error of the reward: {facts['reward']['held_out']}")
     if trained.card.task or "reward" in facts:
-        click.echo(f"next: acwm policy evaluate {where}")
+        click.echo(f"next: acwm policy evaluate {shlex.quote(str(where))}")
 
 
 @policy.command()

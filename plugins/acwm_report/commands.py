@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ def evaluate(
     from acwm_interventions.evaluate import evaluate_run
 
     print_summary(evaluate_run(run, data=data, overrides=overrides, **where))
-    click.echo(f"next: acwm report {where['out'] or run}")
+    click.echo(f"next: acwm report {shlex.quote(str(where['out'] or run))}")
 
 
 @click.command()

@@ -11,6 +11,8 @@ import pyarrow  # pyright: ignore[reportMissingTypeStubs]
 from numpy.typing import NDArray
 from pyarrow import compute, csv  # pyright: ignore
 
+from acwm_core.files import check_fetched
+
 # They have no types.
 _arrow, _compute, _csv = cast(Any, pyarrow), cast(Any, compute), cast(Any, csv)
 
@@ -28,6 +30,7 @@ def logged(run: Path, column: str) -> tuple[list[float], list[float]]:
     file = run / "metrics.csv"
     if not file.exists():
         return [], []
+    check_fetched(file)
     rows: NDArray[np.float64] = np.concatenate([np.zeros((0, 2)), *_chunks(file, column)])
     together = -(-len(rows) // POINTS)
     if together > 1:

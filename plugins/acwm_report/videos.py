@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -61,7 +62,8 @@ def embed_videos(runs: Sequence[EvaluatedRun], megabytes: float) -> list[list[Em
         run, record = runs[number], runs[number].summary.videos[index]
         path = result_file(run.folder / FOLDER, f"{VIDEOS}/{record.file}")
         if not path.is_file():
-            raise DataError(f"the video {path} is missing: run `acwm evaluate {run.folder}` again")
+            evaluate = shlex.join(["acwm", "evaluate", str(run.folder)])
+            raise DataError(f"the video {path} is missing: run `{evaluate}` again")
         if path.stat().st_size <= room:
             room -= path.stat().st_size
             key = f"{run.key}-{path.stem}".replace(":", "-").replace(" ", "-")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,7 +109,8 @@ def read_severity(run: Path, weights: str = "") -> list[SeverityCurve]:
         try:
             curves.append(read_json(path, SeverityCurve, "a curve"))
         except DataError as error:
-            again = f"run `acwm evaluate {run} --sweep factors.{path.stem}=…` again"
+            evaluate = shlex.join(["acwm", "evaluate", str(run)])
+            again = f"run `{evaluate} --sweep factors.{path.stem}=…` again"
             raise DataError(f"{error}: {again}") from None
     return [c for c in curves if weights in ("", c.provenance["weights_sha256"])]
 

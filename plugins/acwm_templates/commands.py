@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -55,4 +56,5 @@ def new(
     place = out or Path(package_of(kind, name))
     folder = write_package(kind, name, place, environment, weights, gym)
     checked = f"{environment}.{name}" if kind == "task" else name
-    click.echo(f"made {folder}; next: pip install -e {folder} && acwm check {checked}")
+    place = shlex.quote(str(folder))
+    click.echo(f"made {folder}; next: pip install -e {place} && acwm check {checked}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def ship(run: Path, overrides: tuple[str, ...], out: Path, data: Path | None) ->
     made = pack(run, out, overrides=overrides, data=data)
     size = sum(file.stat().st_size for file in made.rglob("*") if file.is_file())
     click.echo(
-        f"{made}: {size / 1e6:.1f} MB; its card is {made / 'README.md'}; next: acwm rollout {made}"
+        f"{made}: {size / 1e6:.1f} MB; its card is {made / 'README.md'}; "
+        f"next: acwm rollout {shlex.quote(str(made))}"
     )
 
 

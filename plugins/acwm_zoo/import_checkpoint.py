@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -46,4 +47,5 @@ def import_checkpoint(
     )
     for note in imported.notes:
         click.echo(f"  {note}")
-    click.echo(f"next: acwm evaluate {imported.run}, with its dataset in {recipe.data['path']}")
+    evaluate = shlex.join(["acwm", "evaluate", str(imported.run)])
+    click.echo(f"next: {evaluate}, with its dataset in {recipe.data['path']}")

@@ -1,11 +1,17 @@
 """Formats on the command line: import, train, report, export; and formats of a third party."""
 
 import json
+import re
+import shlex
 
 import pytest
 from click.testing import CliRunner
 
 from acwm_core.cli import main
+from acwm_core.errors import DataError
+from acwm_core.evaluation.results import Summary
+from acwm_core.recipe import compose
+from acwm_formats.videos import Videos
 from tests.formats import release
 
 QUICK = (
@@ -119,3 +125,19 @@ def test_exporting_from_the_command_line(imported, tmp_path):
     run("data", "import", "lerobot", tmp_path / "lerobot", "--out", tmp_path / "l", "--workers", 0)
     facts = [json.loads(run("data", "info", tmp_path / n, "--json")) for n in ("again", "l")]
     assert [fact["splits"]["train"]["frames"] for fact in facts] == [60, 60]
+
+
+def test_printed_commands_name_folders_as_a_shell_reads_them(tmp_path):
+    """Spaces and apostrophes in a path are quoted, in an override as well."""
+    source, out = tmp_path / "my takes", tmp_path / "Ann's data"
+    source.mkdir()
+    Videos.example(source)
+    said = run("data", "import", "videos", source, "--out", out, "--workers", 0)
+    report, fit = re.findall(r"(?:next|with videos): acwm (.*)", said)
+    assert shlex.split(report) == ["data", "report", str(out)]
+    command, recipe, *overrides = shlex.split(fit)
+    assert (command, compose(recipe, overrides).data["path"]) == ("fit", str(out))
+    with pytest.raises(DataError, match="was not evaluated") as refused:
+        Summary.read(out)
+    (evaluate,) = re.findall("`acwm (.*)`", str(refused.value))
+    assert shlex.split(evaluate) == ["evaluate", str(out)]

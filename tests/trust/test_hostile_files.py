@@ -10,11 +10,18 @@ import pytest
 
 from acwm_core import arrays
 from acwm_core.arrays import from_npy, from_npz, load_npz, to_npy, to_npz
+from acwm_core.data.card import DatasetCard
+from acwm_core.data.dataset import Manifest
 from acwm_core.data.shards import open_shard
-from acwm_core.errors import DataError
-from acwm_core.files import check_fetched, check_tree, load_plain, parse_json
+from acwm_core.errors import AcwmError, DataError
+from acwm_core.evaluation.results import Summary
+from acwm_core.evaluation.storage import load_scores
+from acwm_core.files import check_fetched, check_tree, load_plain, parse_json, training_record
+from acwm_core.recipe import compose
 from acwm_core.training.run import read_metadata
+from acwm_report.metrics_file import logged
 
+EPISODES = "evaluation/episodes.parquet"
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 
 
@@ -147,3 +154,22 @@ def test_a_pointer_of_git_lfs_is_named(tmp_path):
     path.write_bytes(b"{}")
     check_fetched(path)
     check_fetched(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("card.yaml", DatasetCard.read),
+        ("manifest.jsonl", Manifest),
+        ("recipe.yaml", lambda folder: compose(folder / "recipe.yaml", [])),
+        ("evaluation/summary.json", Summary.read),
+        ("evaluation/episodes.parquet", lambda folder: load_scores(folder / EPISODES)),
+        ("metrics.csv", lambda folder: logged(folder, "loss")),
+        ("estimator.safetensors", lambda folder: training_record(folder / "estimator.safetensors")),
+    ],
+)
+def test_a_pointer_in_the_place_of_any_file_of_a_dataset_or_run(tmp_path, name, read):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(POINTER)
+    with pytest.raises(AcwmError, match=r"pointer of Git LFS .*: run `git lfs pull` there$"):
+        read(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,7 +157,7 @@ def short_form(survey: Survey) -> list[str]:
     """The verdict and what is wrong, in lines for a terminal."""
     marks = {"bad": "✗", "note": "·", "good": "✓"}
     lines = [f"{marks[finding.level]} {finding.text}" for finding in survey.findings]
-    return [*lines, f"all of it, with videos: acwm data report {survey.path}"]
+    return [*lines, f"all of it, with videos: acwm data report {shlex.quote(str(survey.path))}"]
 
 
 def _counted(count: int, noun: str) -> str:

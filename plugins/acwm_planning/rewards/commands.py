@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -56,5 +57,5 @@ def train_reward(data: Path, column: str, states: str, out: Path | None, **optio
     if card.held_out.low is None:
         click.echo("fewer than five episodes are held out: too few for an interval")
     if card.state:
-        click.echo(f"next: acwm policy train {name} MODEL --reward {where}")
-    click.echo(f"next: acwm plan MODEL TASK cost=reward cost.head={where}")
+        click.echo(f"next: acwm policy train {name} MODEL --reward {shlex.quote(str(where))}")
+    click.echo(f"next: acwm plan MODEL TASK cost=reward {shlex.quote(f'cost.head={where}')}")
