@@ -28,6 +28,7 @@ class ResumableResults:
     settings: Mapping[str, Any]  # everything that determines the results
     keys: tuple[str, str] = ("row", "seed")  # the keys of a line that identify its episode
     kind: Any = dict[str, Any]  # a dataclass with the types of a line's entries, or several
+    file: str = EPISODES_FILE  # name of the file with a line for each episode
 
     def __post_init__(self) -> None:
         settings, path = json.loads(json.dumps(self.settings)), self.folder / SETTINGS_FILE
@@ -53,7 +54,7 @@ class ResumableResults:
         Damaged lines are reported and left out, so that their episodes are played again, as are
         those of lines that a killed command wrote only in part.
         """
-        path, lines, damaged = self.folder / EPISODES_FILE, dict[tuple[str, int], Line](), 0
+        path, lines, damaged = self.folder / self.file, dict[tuple[str, int], Line](), 0
         content = path.read_bytes() if path.exists() else b""
         for text in content.split(b"\n"):
             try:
@@ -78,12 +79,12 @@ class ResumableResults:
             try:
                 yield
             finally:
-                if not (self.folder / EPISODES_FILE).exists():
+                if not (self.folder / self.file).exists():
                     (self.folder / SETTINGS_FILE).unlink(missing_ok=True)
 
     def add(self, *lines: Line) -> None:
         """Append results at once, on a new line if the last line was cut off."""
-        path = self.folder / EPISODES_FILE
+        path = self.folder / self.file
         text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
         with writing(path), path.open("a+b") as file:
             if file.tell() and path.read_bytes()[-1:] != b"\n":

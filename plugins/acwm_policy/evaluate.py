@@ -161,6 +161,7 @@ def evaluate_policy(
     seeds: Sequence[int],
     run: str | Path | None = None,
     beside: Path | None = None,
+    rows: Sequence[str] = ROWS,
     out: Path | None = None,
     device: str = "auto",
     progress: bool = False,
@@ -172,6 +173,7 @@ def evaluate_policy(
         seeds: numbers of episodes of the test split, the same for all rows.
         run: the model to dream in; by default the one that the policy was trained with.
         beside: folder of another policy for the same task, to compare with.
+        rows: those of `ROWS` to play.
         out: folder of the results; `EVALUATION` within `folder` by default.
         device: device of the model.
         progress: show a progress bar.
@@ -210,8 +212,8 @@ def evaluate_policy(
         environment = TaskEnvironment(inner, task)
         without = {DREAM} if not dreams(bundle, policy) else set[str]()
         without |= {BESIDE} if other is None else set()
-        rows = [row for row in ROWS if row not in without]
-        table = EvaluatedEpisodes(policy, bundle, environment, rows, other)
+        played = [row for row in ROWS if row in rows and row not in without]
+        table = EvaluatedEpisodes(policy, bundle, environment, played, other)
         results = ResumableResults(where, identity, kind=EpisodeLine)
         with results.adding():
             label = f"evaluating at {task.name}" if progress else ""

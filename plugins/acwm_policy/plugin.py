@@ -1,4 +1,4 @@
-"""Registers the kind learner, some learners, and `acwm policy`."""
+"""Registers the kind learner and some learners."""
 
 from acwm_core.plugins import Registry, hookimpl
 
@@ -38,15 +38,4 @@ def register_learners(registry: Registry) -> None:
         "clone",
         "acwm_policy.clone:Clone",
         summary="does what was done in recordings (behaviour cloning)",
-    )
-
-
-@hookimpl
-def register_commands(registry: Registry) -> None:
-    """Add `acwm policy`, after `acwm rank`."""
-    registry.add(
-        "policy",
-        "acwm_policy.commands:policy",
-        summary="train a policy in a model, and evaluate it in the simulator",
-        after="rank",
     )

@@ -24,7 +24,13 @@ from acwm_core.files import held, load_plain, read_json, writing, written_whole
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.threads import use_threads
-from acwm_planning.policies.saved import PolicyCard, PolicyInputs, SavedPolicy, layers_of
+from acwm_planning.policies.saved import (
+    POLICY_FILE,
+    PolicyCard,
+    PolicyInputs,
+    SavedPolicy,
+    layers_of,
+)
 from acwm_planning.rewards.task import RewardTask
 from acwm_policy.learner import Learner
 from acwm_policy.lesson import (
@@ -72,6 +78,7 @@ def train_policy(
     starts: int = 256,
     data: Path | None = None,
     reward: Path | None = None,
+    after: Path | None = None,
     seed: int = 0,
     device: str = "auto",
     progress: bool = False,
@@ -91,6 +98,8 @@ def train_policy(
         starts: number of training episodes whose starts are used.
         data: dataset to take the starts from instead of the simulator, or to imitate.
         reward: folder of a reward head, to maximise in place of a task; `task` is the environment.
+        after: folder of a policy to begin with, which the same learner has trained, for example in
+            an earlier model; its steps count.
         seed: of the starts, the network and the exploration.
         device: device of the model.
         progress: show a progress bar.
@@ -99,12 +108,8 @@ def train_policy(
         DataError: `out` holds a policy that was trained otherwise.
         RecipeError: the model predicts too little for the task, or a parameter is wrong.
     """
-    kind = learner_class(settings.algorithm)
-    place = kind.places[0] if place is None else place
-    if place not in kind.places:
-        known = " or ".join(PLACES[choice] for choice in kind.places)
-        raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
-    steps = kind.usual_steps if steps is None else steps
+    place = _place_of(settings, place)
+    steps = learner_class(settings.algorithm).usual_steps if steps is None else steps
     if place == "recordings":
         if reward is not None:
             raise RecipeError(f"{settings.algorithm} imitates recordings, and maximises no reward")
@@ -125,6 +130,7 @@ def train_policy(
         "scenes": number,
         "starts": starts,
         "data": None if data is None else str(data),
+        "after": None if after is None else file_sha256(after / POLICY_FILE),
         "seed": seed,
         **asdict(settings),
     }
@@ -134,6 +140,8 @@ def train_policy(
         use_threads(None, None, choose=True)
         bundle.world_model.to(choose_device(device))
         stored = load_checkpoint(out / CHECKPOINT)
+        if stored is None and after is not None:
+            stored = load_checkpoint(after / CHECKPOINT)
         begun = beginnings(bundle, asked, starts, data, place)
         lesson = prepare(
             *(bundle, asked, begun, place, number),
@@ -144,6 +152,15 @@ def train_policy(
         )
         with closing(lesson.source):
             return _learn(lesson, settings, about, out, steps, stored, progress)
+
+
+def _place_of(settings: PolicySettings, place: Place | None) -> Place:
+    """What a policy is to learn from; the learner's usual place by default."""
+    places = learner_class(settings.algorithm).places
+    if place is not None and place not in places:
+        known = " or ".join(PLACES[choice] for choice in places)
+        raise RecipeError(f"{settings.algorithm} learns {known}, not {PLACES[place]}")
+    return place or places[0]
 
 
 def _imitate(

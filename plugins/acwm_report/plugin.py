@@ -11,39 +11,13 @@ def register_commands(registry: Registry) -> None:
         "acwm_report.commands:data_report",
         summary="write a page about a dataset",
     )
-    registry.add(
-        "evaluate",
-        "acwm_report.commands:evaluate",
-        summary="measure how good a trained model is",
-        after="import-checkpoint",
-    )
-    registry.add(
-        "plan",
-        "acwm_report.planning:plan",
-        summary="act by planning with a model, in the simulator",
-        after="evaluate",
-    )
-    registry.add(
-        "rank",
-        "acwm_report.planning:rank",
-        summary="rank policies in a model, and compare with the simulator",
-        after="plan",
-    )
-    registry.add(
-        "report",
-        "acwm_report.commands:report",
-        summary="write the report of evaluated runs",
-        after="evaluate",
-    )
-    registry.add(
-        "compare",
-        "acwm_report.commands:compare",
-        summary="test which runs differ significantly",
-        after="report",
-    )
-    registry.add(
-        "leaderboard",
-        "acwm_report.commands:leaderboard",
-        summary="collect the results of many runs in one page",
-        after="compare",
-    )
+    for name, module, summary, after in (
+        ("evaluate", "commands", "measure how good a trained model is", "import-checkpoint"),
+        ("plan", "planning", "act by planning with a model, in the simulator", "evaluate"),
+        ("rank", "planning", "rank policies in a model, and compare with the simulator", "plan"),
+        ("policy", "policy", "train a policy in a model, and measure it in the simulator", "rank"),
+        ("report", "commands", "write the report of evaluated runs", "evaluate"),
+        ("compare", "commands", "test which runs differ significantly", "report"),
+        ("leaderboard", "commands", "collect the results of many runs in one page", "compare"),
+    ):
+        registry.add(name, f"acwm_report.{module}:{name}", summary=summary, after=after)

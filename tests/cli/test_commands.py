@@ -36,7 +36,7 @@ def refused(*arguments: str | Path) -> str:
 def test_the_promised_commands_are_there_in_the_order_of_their_use() -> None:
     promised = (
         "list show generate data encode fit import-checkpoint evaluate report compare leaderboard "
-        "benchmark score plan rank rollout play serve experiment policy check new doctor "
+        "benchmark score plan rank policy rollout play serve experiment check new doctor "
     )
     listed = main.list_commands(click.Context(main))
     assert " ".join(listed).startswith(promised)

@@ -1,8 +1,9 @@
-"""`acwm policy train` and `acwm policy evaluate`."""
+"""`acwm policy`: train a policy in a model, evaluate it, and improve both in turn."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, ExistingFolder, seeds_of
 from acwm_planning.rewards import HEAD_FILE
+from acwm_report.terminal import print_page_table
 
 POLICY = ExistingFolder(
     "policy's folder", "policy.safetensors", "`acwm policy train ENVIRONMENT.TASK`"
@@ -25,6 +27,18 @@ NAMES = {
     "still": "no motion",
 }
 """What the rows of the table are called."""
+
+
+RECIPE_SECTIONS = ("training.", "trainer.", "data.", "objective.")
+"""With what an override of a model's recipe begins."""
+
+
+def model_of(task: str, words: Sequence[str]) -> str:
+    """The model among the words of a command; by default that of the environment."""
+    models = [word for word in words if "=" not in word]
+    if len(models) > 1:
+        raise click.BadParameter(f"give one model, not {', '.join(models)}")
+    return models[0] if models else task.partition(".")[0]
 
 
 @click.group()
@@ -86,16 +100,13 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     """
     from acwm_policy.settings import settings_of
 
-    models = [word for word in words if "=" not in word]
-    if len(models) > 1:
-        raise click.BadParameter(f"give one model, not {', '.join(models)}")
+    model = model_of(task, words)
     settings = settings_of([word for word in words if "=" in word])
 
     from acwm_planning.policies.saved import default_folder
     from acwm_policy.train import train_policy
 
     where = out or default_folder(task)
-    model = models[0] if models else task.partition(".")[0]
     trained = train_policy(
         model, task, settings=settings, out=where, place=place, progress=True, **options
     )
@@ -107,6 +118,78 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
         click.echo(f"error of the reward: {facts['reward']['held_out']}")
     if trained.card.task or "reward" in facts:
         click.echo(f"next: acwm policy evaluate {shlex.quote(str(where))}")
+
+
+@policy.command()
+@click.argument("task", metavar="ENVIRONMENT.TASK")
+@click.argument("words", nargs=-1, metavar="[MODEL] [OVERRIDES]...")
+@click.option("--rounds", type=click.IntRange(0), default=3, help="Rounds after the first policy.")
+@click.option(
+    "--episodes",
+    type=click.IntRange(1),
+    default=32,
+    help="Episodes that the policy collects in the simulator in a round.",
+)
+@click.option(
+    "--noise",
+    type=click.FloatRange(0, 1),
+    default=0.2,
+    help="Noise of its decisions there, a share of half the range of an action.",
+)
+@click.option(
+    "--data",
+    type=DATASET,
+    help="Simulated dataset to add them to, such as the model's own; by default it begins with as "
+    "many episodes of the behaviour policy.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    help="Steps that the policy learns for in a round; by default as many as the algorithm "
+    "declares.",
+)
+@click.option("--scenes", type=click.IntRange(1), help="Scenes side by side; 64 by default.")
+@click.option(
+    "--starts", type=click.IntRange(1), default=256, help="Training episodes to start from."
+)
+@click.option("--seeds", default="0..19", callback=seeds_of, help="Episodes that measure a round.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the training.")
+@click.option("--workers", type=click.IntRange(0), help="Processes that simulate; one per core.")
+@click.option(
+    "--out", type=OUT_FOLDER, help="The folder; runs/improved/ENVIRONMENT.TASK by default."
+)
+@click.option("--device", default="auto", help="Device of the model while the policy learns.")
+def improve(task: str, words: tuple[str, ...], out: Path | None, **options: Any) -> None:
+    """Improve a model and a policy in turn: collect, train both further, and measure.
+
+    In each round the policy acts in the simulator, with noise; what it did is added to the data;
+    the model is trained further on all of it, and the policy in the model. MODEL and OVERRIDES are
+    those of `acwm policy train`; overrides of the model's recipe have its sections in front, such
+    as trainer.max_steps=400. Each round measures the success in the dream and in the simulator on
+    the same episodes. If it is interrupted, run the same command again to continue; with more
+    --rounds it goes on.
+    """
+    from acwm_policy.settings import settings_of
+
+    of_recipe = [word for word in words if word.startswith(RECIPE_SECTIONS)]
+    own = [word for word in words if "=" in word and word not in of_recipe]
+    settings, where = settings_of(own), out or Path("runs/improved") / task
+
+    from acwm_policy.improve import improve_policy
+    from acwm_report.policy_page import PAGE_FILE, write_rounds_page
+
+    lines = improve_policy(
+        model_of(task, words),
+        task,
+        settings=settings,
+        out=where,
+        recipe=of_recipe,
+        report=lambda lines: write_rounds_page(where, lines),
+        progress=True,
+        **options,
+    )
+    print_page_table(write_rounds_page(where, lines))
+    click.echo(where / PAGE_FILE)
 
 
 @policy.command()
