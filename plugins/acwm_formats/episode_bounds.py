@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,7 +40,10 @@ COUNTERS = frozenset(
     | {"frame", "frame_idx", "frame_index", "frame_id", "frame_number", "step_id", "step_no"}
     | {"episode_step", "ep_step"}
 )
-CLOCKS = frozenset({"t", "time", "times", "timestamp", "timestamps", "seconds"})
+_CLOCK = re.compile(
+    r"(sim_|ros_|wall_|elapsed_|relative_|header_)?(t|times?|timestamps?|stamp|seconds|elapsed)"
+    r"(_?[(\[]?(s|secs?|seconds|m?sec|ms|us|usec|ns|nsec)[)\]]?)?"
+)
 """Times of the rows, which begin anew with an episode; they may be a state as well."""
 NUMBERS = _names("idx", "idxs", "index", "indices", "id", "ids", "num", "number", "no") | {
     *_WHOSE,
@@ -53,6 +57,18 @@ LAST = frozenset(
 FIRST = frozenset({"is_first", "first", "reset", "resets", "is_reset"})
 STEP_TYPE = "step_type"
 """0 in the first row of an episode, as `dm_env` has it."""
+
+_DEFINITE = (
+    frozenset(
+        name
+        for name in LENGTHS | STARTS | ENDS | EDGES | NUMBERS
+        if name.partition("_")[0] in (*_WHOSE, "lengths")
+    )
+    | FIRST
+    | COUNTERS
+    | {STEP_TYPE}
+)
+"""Names of arrays that may not contradict others: they mean episodes, and nothing within one."""
 
 GOING_ON = frozenset(
     {"discount", "discounts", "continue", "continues", "not_done", "not_dones", "nonterminals"}
@@ -72,6 +88,11 @@ def divides(name: str) -> bool:
     return plain(name) in LENGTHS | STARTS | ENDS | EDGES
 
 
+def is_clock(name: str) -> bool:
+    """Whether an array of this name has the times of the rows, in whatever unit."""
+    return _CLOCK.fullmatch(plain(name)) is not None
+
+
 def tells(name: str) -> bool:
     """Whether an array of this name may tell episodes apart, in whatever way."""
     return divides(name) or plain(name) in NUMBERS | LAST | FIRST | COUNTERS | GOING_ON | {
@@ -83,7 +104,7 @@ def may_tell(name: str, values: Any, count: int) -> bool:
     """Whether an array may tell episodes of `count` rows apart, by its name or by its content."""
     flat = values.ndim == 1 or (values.ndim == 2 and values.shape[1] in (1, 2))
     is_short = flat and 2 <= values.shape[0] < count and values.dtype.kind in "iu"
-    return tells(name) or plain(name) in CLOCKS or is_short
+    return tells(name) or is_clock(name) or is_short
 
 
 def bounds_of(
@@ -121,7 +142,44 @@ def bounds_of(
     if sum(stop - start for start, stop in ordered) != count:
         rows = sum(stop - start for start, stop in ordered)
         raise DataError(f"the episodes that {where} names have {rows} rows, and it has {count}")
+    if len(candidates) > 1:
+        check_agreement(candidates, edges, count, where, flags=flags)
     return edges if len(edges) > 1 else None
+
+
+def check_agreement(
+    candidates: Mapping[str, NDArray[Any]],
+    edges: Bounds,
+    count: int,
+    where: str,
+    *,
+    flags: bool = True,
+) -> None:
+    """Refuse arrays of which one says other episodes than `edges`; arguments as in `bounds_of`.
+
+    Flags of last rows may be set within an episode, as at a success, and so contradict nothing.
+
+    Raises:
+        DataError: one does; names it.
+    """
+    for name, values in candidates.items():
+        says = plain(name)
+        if says not in _DEFINITE and not is_clock(name):
+            continue
+        if not flags and says not in LENGTHS | STARTS | ENDS | EDGES | NUMBERS:
+            continue
+        ordered = np.sort(values) if says in STARTS | ENDS and values.ndim == 1 else values
+        is_edge = says in LENGTHS | STARTS | ENDS | EDGES and len(values) < count
+        own = bounds_of({name: ordered}, count, where) or ([(0, count)] if is_edge else edges)
+        alike = {start for start, _ in edges} == {start for start, _ in own}
+        if says in LENGTHS:  # in any order
+            alike = sorted(b - a for a, b in own) == sorted(b - a for a, b in edges)
+        if not alike:
+            first, others = (", ".join(str(s) for s, _ in each[:4]) for each in (own, edges))
+            raise DataError(
+                f"{where} contradicts itself: by {name}, episodes begin in rows {first}, and by "
+                f"the other arrays in rows {others}: remove what is wrong"
+            )
 
 
 def _as_starts_and_ends(edges: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -195,7 +253,7 @@ def _flagged(known: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
 def _counted(whole: Mapping[str, NDArray[Any]], count: int) -> Bounds | None:
     """Told by a number of the row in its episode, or by its time there, which begin anew."""
     for name, values in whole.items():
-        if name in COUNTERS | CLOCKS and len(values) == count > 1:
+        if (name in COUNTERS or is_clock(name)) and len(values) == count > 1:
             steps = np.diff(values.astype(np.float64))
             usual = 1.0 if name in COUNTERS else float(np.median(steps))
             starts = np.flatnonzero(steps != 1 if name in COUNTERS else steps <= 0) + 1

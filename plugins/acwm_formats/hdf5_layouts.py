@@ -19,7 +19,7 @@ from acwm_core.arrays import check_unpacked
 from acwm_core.errors import DataError
 from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout
-from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, may_tell, tells
+from acwm_formats.episode_bounds import INDEX, Bounds, bounds_of, check_agreement, may_tell, tells
 from acwm_formats.frames import MOST_FRAMES
 from acwm_formats.hdf5_chunks import check_chunks
 from acwm_formats.hdf5_links import check_references, external_links, open_plain
@@ -234,6 +234,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
     Raises:
         DataError: arrays contradict each other.
     """
+    found: Bounds | None = None
     for place in (group, group.parent, group.file) if alone else (group,):
         parts = {"": place} | {name: place.get(name) for name in (place if alone else INDEX)}
         for prefix, part in parts.items():
@@ -252,9 +253,11 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
                 if (values := np.asarray(value)).ndim in (1, 2) and may_tell(name, values, count)
             }
             where = f"{group.file.filename} ({', '.join(arrays)})"
-            if arrays and (bounds := bounds_of(arrays, count, where, flags=alone)):
-                return bounds
-    return None
+            if found:
+                check_agreement(arrays, found, count, where, flags=alone)
+            elif arrays:
+                found = bounds_of(arrays, count, where, flags=alone)
+    return found
 
 
 def _qualified(group: str, name: str) -> str:

@@ -21,7 +21,7 @@ from acwm_formats.frames import ImageFrames, file_stamp, regular_times
 from acwm_formats.images import CHANNELS
 from acwm_formats.names import exact, word, words
 from acwm_formats.rlds_features import FEATURES, Feature, Lists, read_features
-from acwm_formats.sources import damage_of, guarded
+from acwm_formats.sources import damage_of, files_in, guarded
 from acwm_formats.texts import text_fact, text_note
 from acwm_formats.tfrecords import RecordPlace, parse_example, read_record, record_places
 from acwm_formats.timeline import ActionFacts, RecordedDataset, Samples, TimedRecording
@@ -349,7 +349,7 @@ def _shards(folder: Path) -> list[Shard]:
         DataError: there are none, they are of several datasets, or of another kind.
     """
     shards: list[Shard] = []
-    for path in sorted(folder.iterdir()):
+    for path in files_in(folder, [""]):
         if match := SHARD.fullmatch(path.name):
             numbers = int(match["number"]), int(match["of"])
             shards.append(Shard(path, match["name"], match["split"], *numbers))

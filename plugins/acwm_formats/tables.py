@@ -30,7 +30,10 @@ SECONDS = {
 }
 """Length of a unit of time in seconds, by the end of the column's name."""
 
-TIMES = ("time", "timestamp", "timestamps", "t", "seconds", "stamp")
+TIMES = (
+    *("time", "timestamp", "timestamps", "t", "seconds", "stamp"),
+    *("sim_time", "ros_time", "wall_time", "elapsed_time", "elapsed", "relative_time"),
+)
 FRAMES = (
     *("frame", "frame_index", "frame_id", "frame_idx", "frame_number"),
     *("step", "step_index", "step_idx"),
@@ -204,7 +207,8 @@ def _numbered(rows: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     if not edges or len(counts) != 1 or {len(v) for v in edges.values()} == counts:
         return rows
     (count,) = counts
-    bounds = bounds_of(edges, count, f"{path} ({', '.join(edges)})") or [(0, count)]
+    numbering = {name: values for name, values in arrays.items() if _is_episode(name)}
+    bounds = bounds_of(edges | numbering, count, f"{path} ({', '.join(edges)})") or [(0, count)]
     numbers = np.zeros(count, np.int64)
     for number, (start, stop) in enumerate(bounds):
         numbers[start:stop] = number

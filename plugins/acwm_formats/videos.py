@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acwm_core.errors import DataError, suggest
-from acwm_formats.episode_bounds import bounds_of, tells
+from acwm_formats.episode_bounds import bounds_of, is_clock, tells
 from acwm_formats.example import write_example_videos
 from acwm_formats.format import Format
 from acwm_formats.frames import ImageFrames, VideoFrames, file_stamp, regular_times, video_index
@@ -249,26 +249,32 @@ class VideoFolder:
         rows = _read_once(path, file_stamp(path)) if self.table else read_table(path)
         column = self.columns.episode if self.table else episode_column(rows)
         if self.table and column:
-            return _rows_of(rows, column, index, place, self.count, path), path
-        if column and (known := len({*rows[column].tolist()})) > 1:
+            rows = _rows_of(rows, column, index, place, self.count, path)
+        elif column and (known := len({*rows[column].tolist()})) > 1:
             raise DataError(
                 f"the column {column} of {path} numbers {known} episodes, but {place.name} "
                 "is one: record a video for each"
             )
-        numbering = (
-            {} if self.table else {name: values for name, values in rows.items() if tells(name)}
-        )
+        elif self.table and place.rows:
+            start, stop, count = place.rows
+            if (own := len(next(iter(rows.values())))) != count:
+                raise DataError(f"{path} has {own} rows, but its episodes have {count} pictures")
+            rows = {name: values[start:stop] for name, values in rows.items()}
+        self._check_one(rows, place, path)
+        return rows, path
+
+    def _check_one(self, rows: Table, place: VideoEpisode, path: Path) -> None:
+        """Refuse rows of several episodes beside the frames of one."""
+        numbering = {
+            "time" if name == self.columns.time else name: values
+            for name, values in rows.items()
+            if name == self.columns.time or is_clock(name) or (tells(name) and not self.table)
+        }
         if several := bounds_of(numbering, len(next(iter(rows.values()))), str(path)):
             raise DataError(
                 f"{path} has {len(several)} episodes, by {', '.join(numbering)}, but {place.name} "
                 "is one: record a video for each"
             )
-        if self.table and place.rows:
-            start, stop, count = place.rows
-            if (own := len(next(iter(rows.values())))) != count:
-                raise DataError(f"{path} has {own} rows, but its episodes have {count} pictures")
-            rows = {name: values[start:stop] for name, values in rows.items()}
-        return rows, path
 
     def _frames(self, source: Path, times: NDArray[np.float64] | None, begins: str) -> Frames:
         """A video, or pictures with the times of `rate` or else of the table's rows."""

@@ -7,6 +7,7 @@ import functools
 import itertools
 import math
 import re
+import warnings
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_fetched
 from acwm_formats.array_store import ArrayLayout, ArrayStore, StoredEpisode, StoredEpisodes
 from acwm_formats.channels import Channels
-from acwm_formats.episode_bounds import bounds_of, may_tell, tells
+from acwm_formats.episode_bounds import bounds_of, check_agreement, is_clock, may_tell, tells
 from acwm_formats.format import Format
 from acwm_formats.frames import DENSE, MOST_FRAMES, stack_note
 from acwm_formats.images import CHANNELS, MOST_BYTES, stacked
@@ -60,9 +61,8 @@ PACKERS = frozenset({"blosc", "zstd", "zlib", "lz4", "gzip", "bz2", "lzma"})
 CODECS = PACKERS | {
     *("shuffle", "delta", "fixedscaleoffset", "astype", "bitround", "quantize", "packbits"),
     *("crc32", "crc32c", "adler32", "fletcher32", "bytes", "transpose", "sharding", "vlenutf8"),
-    *("imagecodecs_jpegxl", "imagecodecs_jpeg2k", "imagecodecs_webp"),
 }
-"""Codecs of numbers and images. Others are refused: those of objects run code as they read."""
+"""Codecs of numbers. Others are refused: those of objects run code as they read."""
 
 WIDEST = 8
 """How many times larger numbers may be as a filter has them than in the array."""
@@ -391,6 +391,21 @@ class Buffer(ArrayStore):
         Raises:
             DataError: nothing says it, or what does contradicts itself.
         """
+        ends = self._stored_ends()
+        edges = [*itertools.pairwise([0, *ends])]
+        for group in ("data", "meta", ""):
+            if not group or group in self._group:
+                arrays = {name: self.array(f"{group}/{name}") for name in self.names(group=group)}
+                known = {
+                    name: self._rows(f"{group}/{name}")
+                    for name, array in arrays.items()
+                    if array.ndim in (1, 2) and (tells(name) or is_clock(name))
+                }
+                check_agreement(known, edges, ends[-1], f"{self.path} ({group or 'its root'})")
+        return ends
+
+    def _stored_ends(self) -> list[int]:
+        """Where each episode ends, by the first array that says it; raises as `ends`."""
         place = next((name for name in (*PLACES, *NUMBERED) if name in self._group), None)
         if place is None:
             return self._ends_by_content()
@@ -429,13 +444,17 @@ class Buffer(ArrayStore):
 
 @contextlib.contextmanager
 def _pointers_named(root: Path) -> Generator[None]:
-    """Where the block fails, report files that Git LFS has not fetched, or an unknown codec."""
+    """Where the block fails, report files that Git LFS has not fetched, or an unknown codec.
+
+    Zarr's own warnings are left out: of files of other programs beside the arrays, for example.
+    """
     try:
-        yield
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            yield
     except (numcodecs.errors.UnknownCodecError, zarr.errors.UnknownCodecError) as error:
         codec = re.sub(r".*: |['\"]", "", str(error))
         raise DataError(
-            f"{root} has arrays stored by {codec}, which is not installed: store them again with "
+            f"{root} has arrays stored by {codec}, which is not read: store them again with "
             "another codec, such as zstd"
         ) from error
     except Exception:

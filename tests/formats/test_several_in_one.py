@@ -118,6 +118,51 @@ WRONG = {
 }
 
 
+CONTRARY = {
+    "numbers": ({"episode_ends": ENDS}, {"episode_index": NUMBERS >= 2}),
+    "lengths": ({"episode_ends": ENDS}, {"ep_len": (20, 19)}),
+    "a first row": ({"episode_ends": ENDS}, {"is_first": np.arange(COUNT) % 13 == 0}),
+    "steps": ({"ep_len": LENGTHS}, {"frame_index": np.arange(COUNT) % 13}),
+    "times": ({"episode_ends": ENDS}, {"timestamp": np.arange(COUNT) % 13 / 10}),
+    "two numbers": ({"episode_index": NUMBERS}, {"traj_id": NUMBERS >= 2}),
+    "one episode": ({"episode_ends": [COUNT]}, {"episode_index": NUMBERS}),
+}
+
+
+@pytest.mark.parametrize(("one", "other"), CONTRARY.values(), ids=CONTRARY)
+def test_arrays_that_contradict_each_other_are_refused(tmp_path, one, other):
+    """Beside each other, in two groups, in Zarr and in a table."""
+    says = {name: np.asarray(values) for name, values in {**one, **other}.items()}
+    with pytest.raises(DataError, match=r"it contradicts itself: by \w+, episodes begin in"):
+        bounds_of(says, COUNT, "it")
+    path = file_of(tmp_path / "all.h5", one, beside="meta")
+    group = zarr.open_group(str(tmp_path / "b.zarr"), mode="w", zarr_format=2)
+    arrays = {"data/img": frames(), "data/action": ROWS}
+    arrays |= {f"meta/{name}": np.asarray(values) for name, values in one.items()}
+    with h5py.File(path, "a") as file:
+        for name, values in other.items():
+            file[name] = arrays[f"data/{name}"] = np.asarray(values)
+    for name, values in arrays.items():
+        group.create_array(name, data=values)
+    with pytest.raises(DataError, match="contradicts itself"):
+        HDF5().read(path, video="pixels", actions="action", rate=10).splits[0]
+    with pytest.raises(DataError, match="contradicts itself"):
+        ZarrReplay().read(tmp_path / "b.zarr", rate=10)
+
+
+def test_arrays_that_say_the_same_may_stand_beside_each_other():
+    """Flags of last rows may be set within an episode, and lengths be in another order."""
+    says = {"episode_ends": ENDS, "episode_index": NUMBERS, "ep_len": LENGTHS, "ep_offset": STARTS}
+    says |= {"timestamp": np.arange(COUNT) - STARTS[NUMBERS], "done": np.arange(COUNT) % 5 == 0}
+    says |= {"id": np.arange(COUNT) // 3, "stage_time": np.arange(COUNT) % 4}
+    edges = list(zip(STARTS.tolist(), ENDS.tolist(), strict=True))
+    arrays = {name: np.asarray(values) for name, values in says.items()}
+    assert bounds_of(arrays, COUNT, "it") == edges
+    order = [2, 0, 3, 1]
+    turned = {"ep_len": np.array(LENGTHS)[order], "ep_offset": STARTS[order], "episode": NUMBERS}
+    assert sorted(bounds_of(turned, COUNT, "it") or []) == edges
+
+
 @pytest.mark.parametrize("says", WRONG.values(), ids=WRONG)
 def test_what_contradicts_itself_is_refused(tmp_path, says):
     path = file_of(tmp_path / "all.h5", says)
@@ -376,6 +421,9 @@ def test_one_video_of_several_episodes_is_refused(tmp_path, column):
         ({"done": [0, 0, 1, 0, 0, 1]}, True),
         ({"is_first": [1, 0, 0, 1, 0, 0]}, True),
         ({"step": [0, 1, 2, 0, 1, 2]}, True),
+        ({"time": [0, 0.1, 0.2, 0, 0.1, 0.2]}, True),
+        ({"time_ms": [70, 170, 270, 72, 172, 272]}, True),
+        ({"sim_time": [0, 1, 2, 0, 1, 2]}, True),
         ({"done": [0, 0, 0, 0, 1, 1]}, False),
         ({"step": [0, 1, 2, 3, 4, 5]}, False),
     ],
@@ -389,7 +437,7 @@ def test_a_table_that_ends_more_than_once_is_refused(tmp_path, column, several):
     if not several:
         np.testing.assert_array_equal(found[0].actions.values[:, 0], range(6))
         return
-    with pytest.raises(DataError, match=f"has 2 episodes, by {name}, but a is one"):
+    with pytest.raises(DataError, match=r"has 2 episodes, by .*, but a is one"):
         found[0]
 
 
