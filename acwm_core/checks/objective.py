@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any, cast, get_args
 
 import torch
@@ -124,6 +125,24 @@ class ObjectiveChecks(PredictionTrial):
         together = self._predict(latents[:, :1], modulation)[:1]
         error = batch_error(together, self._predict(latents[:1, :1], modulation[:1]))
         expect(error < 1e-3, f"predictions change by {error:.2g} with the rest of the batch")
+
+    def weights_count(self) -> None:
+        """With `weighs_frames`, multiply the error of each clip's frames by their weights."""
+        if not self._objective.weighs_frames:
+            raise NotTried("it weighs no frames")
+        if type(self._objective).prepare is not cast(Any, Objective).prepare:
+            raise NotTried("it may weigh them before the first step")
+        latents, modulation = self._inputs()
+        weights = torch.tensor([[0.5], [3.0]]).expand(BATCH, FRAMES)
+        clips = zip(latents[:, None], modulation[:, None], weights, strict=True)
+        parts = [
+            self._loss(self._model, *clip, first=number).item() * weight[0].item()
+            for number, (*clip, weight) in enumerate(clips)
+        ]
+        batch = replace(batch_of(latents, modulation), weights=weights)
+        whole, mean = self._objective.loss(self._model, batch, 1).item(), sum(parts) / BATCH
+        off = abs(whole - mean) / max(abs(mean), 1e-6)
+        expect(off < 1e-3, f"the weighed loss is {whole:.4g}, and not {mean:.4g}")
 
     def training_lowers_the_loss(self) -> None:
         """Train a tiny model so that the loss on other clips falls."""

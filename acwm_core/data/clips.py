@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from acwm_core.env.card import EnvironmentCard
     from acwm_core.env.symmetry import Symmetry
 
+_Floats = NDArray[np.float32]
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -48,6 +50,9 @@ class DataConfig:
         states: fields of the state that the model learns to predict too, so that it knows where the
             agent is: what a robot knows of itself, e.g. ``[joint_position]``. Rollouts are given
             none. By default those that the model chooses.
+        weights: field of the state with one number per frame, 0 or more: how much the loss of what
+            the action of that frame leads to counts, e.g. ``action_confidence`` of episodes that
+            `acwm data label` wrote. By default all count alike; validation always does.
         symmetries: train on each clip also as the symmetries on the card of the data transform it:
             push_cube, which has seven, gives eight times as many clips. Validation does not.
         growing: train on the episodes that a running `acwm generate` has finished, and look for
@@ -70,6 +75,7 @@ class DataConfig:
     fraction: Annotated[float, Gt(0), Le(1)] = 1.0
     validation_episodes: NonNegativeInt | None = None
     states: tuple[str, ...] = ()
+    weights: str | None = None
     symmetries: bool = False
     growing: bool = False
     cache_latents: bool = True
@@ -80,6 +86,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         if self.states and self.reader != "random_access":
             raise RecipeError("data.states needs data.reader=random_access")
+        if self.weights and self.reader != "random_access":
+            raise RecipeError("data.weights needs data.reader=random_access")
         if self.growing and (self.fraction != 1 or self.reader != "random_access"):
             raise RecipeError(
                 "data.growing uses all episodes and needs data.reader=random_access: "
@@ -212,7 +220,7 @@ def window_actions(actions: NDArray[np.float32], start: int, frames: int) -> NDA
 
 
 def window_states(states: NDArray[np.float32], start: int, frames: int) -> NDArray[np.float32]:
-    """The states `[frames, S]` of a window; after the end of the episode, its last ones."""
+    """The rows `[frames, …]` of a window; after the end of the episode, its last one."""
     window = states[start : start + frames]
     return np.concatenate([window, window[-1:].repeat(frames - len(window), 0)])
 
@@ -232,6 +240,7 @@ class Clips(ABC):
             `shared_lengths`.
         symmetries: of the environment; each window gives one more clip by each of them.
         states: names of fields of the state; batches then hold them.
+        weights: name of the field of the state with the weights of frames; batches then hold them.
 
     Attributes:
         windows: rows ``(episode, first frame)``, one per clip.
@@ -251,17 +260,18 @@ class Clips(ABC):
         per_length: int = 1,
         symmetries: Sequence[Symmetry] = (),
         states: Sequence[str] = (),
+        weights: str | None = None,
     ) -> None:
         self.episodes, self.frames, self.stride = episodes, frames, stride
-        self._fields = tuple(states)
+        self._fields, self._weights = tuple(states), weights
         self.versions: tuple[Symmetry | None, ...] = (None, *symmetries)
         windows = list_windows(episodes.lengths, frames, stride, indices)
         self.windows = windows.repeat(len(self.versions), axis=0)
         self.lengths = clip_lengths(
             self.windows, episodes.lengths, frames, temporal_stride, given, per_length
         )
-        # Actions and fields of the state of recently used episodes.
-        self._read: dict[int, tuple[NDArray[np.float32], list[NDArray[np.float32]]]] = {}
+        # Actions, fields of the state and weights of recently used episodes.
+        self._read: dict[int, tuple[_Floats, list[_Floats], _Floats | None]] = {}
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -279,7 +289,7 @@ class Clips(ABC):
 
         Returns:
             The frames, see the class; ``actions`` float32 ``[B, T, A]``, last rows zero; and
-            ``states`` float32 ``[B, T, S]``, if fields of the state were asked for.
+            ``states`` float32 ``[B, T, S]`` and ``weights`` ``[B, T]``, if they were asked for.
 
         Raises:
             DataError: a shard is missing or damaged.
@@ -300,19 +310,20 @@ class Clips(ABC):
         """What shows the first `frames` frames of some clips."""
 
     def _remember(self, episode: int) -> None:
-        """Read the actions and states of an episode."""
+        """Read the actions, states and weights of an episode."""
         fields = [self.episodes.states(episode, [name]) for name in self._fields]
-        self._read[episode] = self.episodes.actions(episode), fields
+        weights = self.episodes.states(episode, [self._weights])[:, 0] if self._weights else None
+        self._read[episode] = self.episodes.actions(episode), fields, weights
 
     def _inputs(self, index: int, frames: int) -> dict[str, NDArray[np.float32]]:
-        """Actions and states of a clip."""
+        """Actions, states and weights of a clip."""
         episode, start = map(int, self.windows[index])
         symmetry = self.version(index)
         if episode not in self._read:
             if len(self._read) == 2**14:  # a limit for memory; they are small
                 self._read.clear()
             self._remember(episode)
-        actions, fields = self._read[episode]
+        actions, fields, weights = self._read[episode]
         rows = {"actions": window_actions(actions, start, frames)}
         if symmetry:
             rows["actions"] = symmetry.of_actions(rows["actions"])
@@ -321,6 +332,8 @@ class Clips(ABC):
             fields = [_transformed(card, symmetry, *pair) for pair in pairs]
         if fields:
             rows["states"] = window_states(np.concatenate(fields, 1), start, frames)
+        if weights is not None:
+            rows["weights"] = window_states(weights, start, frames)
         return rows
 
 

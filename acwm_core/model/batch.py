@@ -22,12 +22,14 @@ class Batch:
         generators: one CPU generator per clip, the only source of randomness.
         states: what to learn of the scene in each video frame, `[B, T, S]`, as it was recorded.
             None if there is nothing.
+        weights: how much the error of each latent frame counts, `[B, L]`; None if all count alike.
     """
 
     latents: Latent
     conditioning: Conditioning
     generators: Sequence[torch.Generator]
     states: Tensor | None = None
+    weights: Tensor | None = None
 
     def noise(self, frames: int) -> Latent:
         """Standard normal noise `[B, frames, C, h, w]`, of the latents' type and device."""
@@ -41,6 +43,16 @@ class Batch:
         """
         orders = [torch.randperm(among, generator=generator) for generator in self.generators]
         return to_device(torch.stack(orders)[:, :frames], self.latents, torch.int64)
+
+
+def weighed(errors: Tensor, weights: Tensor | None) -> Tensor:
+    """Errors of the last latent frames of clips, `[B, N]`, times the weights of these frames.
+
+    Args:
+        errors: one for each frame.
+        weights: those of all latent frames, `[B, L]`; None leaves the errors as they are.
+    """
+    return errors if weights is None else errors * weights[:, -errors.shape[1] :].to(errors)
 
 
 def noise_of_clips(shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:

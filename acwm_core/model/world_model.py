@@ -124,6 +124,7 @@ class WorldModel(nn.Module):
         actions: Actions,
         generators: Sequence[torch.Generator] = (),
         states: Tensor | None = None,
+        weights: Tensor | None = None,
     ) -> Tensor:
         """Training loss of a batch of clips, a scalar.
 
@@ -132,13 +133,22 @@ class WorldModel(nn.Module):
             actions: raw actions of the clip's T frames, `[B, T, A]`.
             generators: one CPU generator per clip, for its noise; by default seeded from torch's.
             states: raw states of the clip's T frames to learn from, `[B, T, S]`.
+            weights: how much the frame counts that each action leads to, `[B, T]`, 0 or more. A
+                latent frame has the mean weight of the actions that lead to it.
         """
         seeds = torch.randint(2**62, (0 if generators else len(latents),))
         generators = generators or [torch.Generator().manual_seed(int(seed)) for seed in seeds]
         conditioning = self.condition(actions, latents.shape[1])
         known = self.codec.latent_frames(self.context_frames)
-        batch = Batch(latents, conditioning, generators, states)
+        weights = None if weights is None else self._of_latent_frames(weights, latents.shape[1])
+        batch = Batch(latents, conditioning, generators, states, weights)
         return self.objective.loss(self.model, batch, known)
+
+    def _of_latent_frames(self, weights: Tensor, latent_frames: int) -> Tensor:
+        """Weights of actions `[B, T]` as those of the latent frames `[B, L]` that they lead to."""
+        steps = weights[:, : self.codec.video_frames(latent_frames) - 1]
+        means = steps.reshape(len(steps), latent_frames - 1, -1).mean(2)
+        return nn.functional.pad(means, (1, 0), value=1)
 
     def condition(self, actions: Actions, latent_frames: int) -> Conditioning:
         """The embedded raw actions `[B, T, A]` of clips of so many latent frames."""

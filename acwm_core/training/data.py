@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -66,6 +67,7 @@ class ClipData(L.LightningDataModule):
         self._split = self._divided()
         self._symmetries = declared_symmetries(episodes) if config.symmetries else ()
         self._check_states()
+        self._check_weights()
         self._once = max(self.episodes.lengths)  # a stride that gives one clip, at the start
         self._streams = config.reader == "webdataset"
         stride = codec.temporal_stride
@@ -84,6 +86,24 @@ class ClipData(L.LightningDataModule):
                     f"data.states: the card of {self.episodes.path} does not say how the symmetry "
                     f"{symmetry.name} transforms {name}: leave out {name}, or data.symmetries"
                 )
+
+    def _check_weights(self) -> None:
+        """Refuse weights of frames that are not there, or are none."""
+        name, fields = self.config.weights, self.episodes.card.environment.fields
+        if name is None:
+            return
+        where = f"data.weights={name}: {self.episodes.path}"
+        single = [field for field in fields if math.prod(fields[field].shape) == 1]
+        if name not in single:
+            which = f"those with one are {', '.join(single)}" if single else "none has one"
+            raise DataError(f"{where} has no such field of the state with one number: {which}")
+        weights = [self.episodes.states(index, [name]) for index in self._split[0]]
+        wrong = [not (np.isfinite(rows).all() and (rows >= 0).all()) for rows in weights]
+        if any(wrong):
+            episode = self._split[0][wrong.index(True)]
+            raise DataError(f"{where} has weights in episode {episode} that are not 0 or more")
+        if not any(rows.any() for rows in weights):
+            raise DataError(f"{where} has no weight above 0, so nothing would be learnt")
 
     def state_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the states to learn, `[S]` each, over training episodes.
@@ -161,6 +181,7 @@ class ClipData(L.LightningDataModule):
             cached=self._cached,
             per_length=self.clips_per_step if self.trainer else self.config.batch_size,
             symmetries=self._symmetries,
+            weights=self.config.weights,
         )
 
     def _encode(self) -> None:

@@ -119,7 +119,7 @@ def _train(
     config = TrainingConfig(**recipe.training)
     L.seed_everything(config.seed, verbose=False)
     world_model = build_world_model(recipe, episodes.card.environment)
-    _check_states(recipe, world_model)
+    _check_heeded(recipe, world_model)
     start = None
     if config.init_from and checkpoint is None:
         _check_meaning(config, episodes.card.environment)
@@ -163,11 +163,17 @@ def _train(
         _check_saved(run, trainer)
 
 
-def _check_states(recipe: Recipe, world_model: WorldModel) -> None:
+def _check_heeded(recipe: Recipe, world_model: WorldModel) -> None:
     if recipe.data.get("states") and not world_model.objective.learns_states:
         raise RecipeError(
             f"objective={recipe.objective.name} learns no states: leave out data.states, or choose "
             "a model and an objective that do, such as by +scene"
+        )
+    if recipe.data.get("weights") and not world_model.objective.weighs_frames:
+        raise RecipeError(
+            f"objective={recipe.objective.name} weighs no frames: leave out data.weights, or "
+            "choose an objective that does, such as diffusion_forcing, or a scene with "
+            "objective.motion_steps"
         )
 
 

@@ -48,7 +48,8 @@ COMPILED_LENGTHS = 6
 Batch = Mapping[str, Any]
 """``{"latents": [B, L, C, h, w], "actions": [B, T, A], "positions": [B]}``, where positions are the
 clips' places in the stream; or ``"video"``, uint8 `[B, T, 3, H, W]`, instead of the latents; and
-``"states"`` `[B, T, S]` if there are some to learn."""
+``"states"`` `[B, T, S]` if there are some to learn, and ``"weights"`` `[B, T]` of the frames that
+actions lead to."""
 
 
 class TrainingModule(L.LightningModule):
@@ -116,9 +117,9 @@ class TrainingModule(L.LightningModule):
         cast(Any, torch).manual_seed(seed_of(*keys[0]))
         generators = [generator_of(*key) for key in keys]
         with noting(f"in training step {self.global_step + 1}", *self.world_model.children()):
-            latents, actions, states = self._trained_part(batch)
+            latents, actions, states, weights = self._trained_part(batch)
             self.trained_on = len(actions), actions.shape[1]
-            loss = self.world_model.loss(latents, actions, generators, states)
+            loss = self.world_model.loss(latents, actions, generators, states, weights)
         if not loss.requires_grad:
             name = type(self.world_model.model).__name__
             raise TrainingError(
@@ -161,11 +162,11 @@ class TrainingModule(L.LightningModule):
             return batch["latents"].to(self.dtype)
         return self.world_model.encode(batch["video"].to(self.dtype) / 255)
 
-    def _trained_part(self, batch: Batch) -> tuple[Latent, Actions, Tensor | None]:
+    def _trained_part(self, batch: Batch) -> tuple[Latent, Actions, Tensor | None, Tensor | None]:
         """The part of the clips that this step uses: random start, and the current horizon.
 
         Returns:
-            Latents, actions, and the states to learn, if there are some.
+            Latents, actions, and the states to learn and weights, if there are some.
         """
         codec, config, latents = self.world_model.codec, self.config, self.latents(batch)
         whole = latents.shape[1]
@@ -185,12 +186,9 @@ class TrainingModule(L.LightningModule):
             kept -= (kept - shortest) % -(-(whole - shortest) // COMPILED_LENGTHS)
         first = start * codec.temporal_stride
         rows = slice(first, first + codec.video_frames(kept))
-        states = batch.get("states")
-        return (
-            latents[:, start : start + kept],
-            batch["actions"][:, rows],
-            None if states is None else states[:, rows],
-        )
+        optional = (batch.get("states"), batch.get("weights"))
+        states, weights = (None if values is None else values[:, rows] for values in optional)
+        return latents[:, start : start + kept], batch["actions"][:, rows], states, weights
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimiser and a learning-rate schedule that is updated every step."""

@@ -38,6 +38,11 @@ class PreparationClips:
         """The states of the clips of the commonest length, `[N, T, S]`."""
         return self._inputs["states"]
 
+    @property
+    def weights(self) -> Tensor | None:
+        """The weights of the frames of these clips; see `TrainingClips.weights`."""
+        return self._inputs.get("weights")
+
     def latents(self, rows: Tensor) -> Latent:
         """The latents of some clips; see `TrainingClips.latents`."""
         clips, device = self._data.training_clips, self._data.device
@@ -68,9 +73,8 @@ class PreparationClips:
         device = self._data.device
         self._world_model.to(device)
         inputs = self._data.training_clips.inputs(self._alike.tolist())
-        actions = inputs["actions"].to(device)
-        states = inputs.get("states", actions[..., :0])
-        return {"actions": actions, "states": states.to(device)}
+        inputs.setdefault("states", inputs["actions"][..., :0])
+        return {name: values.to(device) for name, values in inputs.items()}
 
     @functools.cached_property
     def _alike(self) -> NDArray[np.int64]:

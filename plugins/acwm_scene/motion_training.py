@@ -24,7 +24,7 @@ def learn_motion(model: SceneDynamics, clips: TrainingClips, states: Tensor, ste
 
     Args:
         model: knows the scale of its states already.
-        clips: their actions; each is seen many times.
+        clips: their actions; each is seen many times, or as often as its actions weigh.
         states: of the clips, with what was read of their points, `[N, T, S + point_size]`.
         steps: 0 only marks what was learnt before, as a resumed run does.
 
@@ -36,8 +36,14 @@ def learn_motion(model: SceneDynamics, clips: TrainingClips, states: Tensor, ste
     random = torch.Generator().manual_seed(clips.seed)
     order = torch.Generator().manual_seed(clips.seed + 1)
 
+    count = min(CLIPS, len(states))
+    weights = None if clips.weights is None else clips.weights[:, :-1].mean(1).cpu()
+
     def loss_of(step: int) -> Tensor:
-        rows = torch.randint(len(states), (min(CLIPS, len(states)),), generator=order)
+        if weights is None:
+            rows = torch.randint(len(states), (count,), generator=order)
+        else:
+            rows = torch.multinomial(weights, count, replacement=True, generator=order)
         rows = rows.to(states.device)
         conditioning = clips.conditioning(rows)
         return model.motion_loss(states[rows], conditioning, random, progress=step / steps)

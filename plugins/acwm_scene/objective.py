@@ -58,6 +58,8 @@ class SceneObjective(Regression):
                 raise RecipeError(f"objective.{name} is {steps}; it must be 0 or more")
         self.state_weight, self.motion_steps = state_weight, motion_steps
         self.point_steps = point_steps
+        # Pictures are drawn of true states, whatever the actions; only motion learns from these.
+        self.weighs_frames = motion_steps > 0
 
     def check_model(self, model: DynamicsModel) -> None:
         """Refuse what is no scene; a scene may draw futures, as its motion learns by them."""

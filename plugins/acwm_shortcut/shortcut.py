@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError
-from acwm_core.model.batch import Batch, to_device
+from acwm_core.model.batch import Batch, to_device, weighed
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, InputKind
 from acwm_core.model.objectives.diffusion_forcing import DiffusionForcing
@@ -90,7 +90,8 @@ class ShortcutForcing(DiffusionForcing):
             target[long] = torch.where(with_step, found.to(target), target[long])
         predicted = evaluation(model, conditioning, step=step)(noisy, sigma).float()
         error = (predicted - target)[:, known:].square().flatten(2).mean(2)
-        return (error * (1 - 0.9 * sigma[:, known:]) if self.ramp else error).mean()
+        error = error * (1 - 0.9 * sigma[:, known:]) if self.ramp else error
+        return weighed(error, batch.weights).mean()
 
     def draw_steps(self, frames: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw places on the way, in (0, 1], and steps of a clip's frames, each `[frames]`.

@@ -11,7 +11,7 @@ import acwm
 
 SIGNATURES = {
     "ClipDataset": "(episodes, *, frames=37, stride=4, indices=None, temporal_stride=None, "
-    "given=1, per_length=1, symmetries=(), states=())",
+    "given=1, per_length=1, symmetries=(), states=(), weights=None)",
     "EpisodeDataset": "(path, split, *, growing=False)",
     "Recipe": "(env, codec, model, conditioner, objective, training, data, evaluation, trainer)",
     "WorldModel": "(codec, model, conditioner, objective, action_low, action_high, *, "
@@ -32,7 +32,7 @@ SIGNATURES = {
 
 OF_A_WORLD_MODEL = {
     "encode": "(self, video)",
-    "loss": "(self, latents, actions, generators=(), states=None)",
+    "loss": "(self, latents, actions, generators=(), states=None, weights=None)",
     "rollout": "(self, given, actions, *, mode=None, steps=None, window=None, seeds=None, "
     "check=True)",
     "stream": "(self, given, actions=None, *, steps=None, context=None, seeds=None)",

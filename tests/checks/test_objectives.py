@@ -96,6 +96,12 @@ class Unlearns(Flawed):
         return 2 * loss.detach() - loss
 
 
+@FLAWS.caught_by("weights count", "the weighed loss is")
+class WeighsNothing(Flawed):
+    def error(self, evaluate, clean, generators, known=1, weights=None):
+        return super().error(evaluate, clean, generators, known)
+
+
 @FLAWS.caught_by("keeps the given frames", "come out changed")
 class ChangesTheGiven(Flawed):
     def predict(self, *given):

@@ -46,6 +46,7 @@ def parts_seen(steps, monkeypatch, **training):
         "latents": counted.expand(2, -1, codec.channels, 2, 2),
         "actions": rows[:, None].expand(2, -1, 2),
         "states": -rows[:, None].expand(2, -1, 3),
+        "weights": rows.expand(2, -1),
         "positions": [0, 1],
     }
     for step in steps:
@@ -54,10 +55,11 @@ def parts_seen(steps, monkeypatch, **training):
         )
         module.training_step(batch, 0)
     found = []
-    for latents, actions, _, states in seen:
+    for latents, actions, _, states, weights in seen:
         first, last = int(latents[0, 0].max()), int(latents[0, -1].max())
         assert actions[0, :, 0].tolist() == rows[first * stride : last * stride + 1].tolist()
         assert states[0, :, 0].tolist() == (-actions[0, :, 0]).tolist()
+        assert torch.equal(weights, actions[..., 0])
         found.append((first, last))
     return found
 

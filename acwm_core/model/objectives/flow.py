@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.errors import RecipeError, check_shape
-from acwm_core.model.batch import Batch, noise_of_clips, to_device
+from acwm_core.model.batch import Batch, noise_of_clips, to_device, weighed
 from acwm_core.model.conditioner import Conditioning
 from acwm_core.model.dynamics import Denoiser, LatentStream
 from acwm_core.model.objectives.objective import Objective
@@ -102,6 +102,7 @@ class FlowMatching(Objective[Denoiser]):
     """
 
     trains = Denoiser
+    weighs_frames = True
     streams_as: type[FlowStream[Any]] | None = None
 
     def __init__(
@@ -131,7 +132,7 @@ class FlowMatching(Objective[Denoiser]):
     def loss(self, model: Denoiser, batch: Batch, known: int) -> Tensor:
         """The error of one evaluation at random noise levels; see `Objective.loss`."""
         evaluate = evaluation(model, batch.conditioning)
-        return self.error(evaluate, batch.latents, batch.generators, known)
+        return self.error(evaluate, batch.latents, batch.generators, known, batch.weights)
 
     def predict(
         self, model: Denoiser, given: Batch, frames: int, steps: int | None = None
@@ -172,6 +173,7 @@ class FlowMatching(Objective[Denoiser]):
         clean: Latent,
         generators: Sequence[torch.Generator],
         known: int = 1,
+        weights: Tensor | None = None,
     ) -> Tensor:
         """Mean weighted squared error of one evaluation at random noise levels, a scalar.
 
@@ -180,6 +182,7 @@ class FlowMatching(Objective[Denoiser]):
             clean: clean latents `[B, L, C, h, w]`, L > `known`.
             generators: one CPU generator per clip.
             known: number of first latent frames that are given.
+            weights: of the latent frames, see `Batch.weights`.
         """
         frames = clean.shape[1] - known
         indices = torch.stack([self.draw(frames, generator) for generator in generators])
@@ -192,7 +195,8 @@ class FlowMatching(Objective[Denoiser]):
         else:
             error = self.to_velocity(prediction, noisy, sigma) - (noise - clean)
         per_frame = error[:, known:].square().flatten(2).mean(2)
-        return (per_frame * to_device(self._weights[indices], per_frame)).mean()
+        errors = per_frame * to_device(self._weights[indices], per_frame)
+        return weighed(errors, weights).mean()
 
     def sample(
         self,

@@ -94,7 +94,8 @@ class NextFrame(FlowMatching):
         sigma = to_device(levels * self.past_noise, latents)
         previous = mix(frames_before(past), noise, sigma)
         after = evaluation(model, batch.conditioning, previous=previous, previous_sigma=sigma)
-        return self.error(self.from_change(after, previous), latents, generators, known)
+        after_previous = self.from_change(after, previous)
+        return self.error(after_previous, latents, generators, known, batch.weights)
 
     def _past(self, model: Denoiser, batch: Batch, known: int) -> Latent:
         """The clips, of which a share of `own_past` is the model's own rollout in one step."""

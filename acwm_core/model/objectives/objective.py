@@ -26,6 +26,8 @@ class TrainingClips(Protocol):
         shows_progress: whether this process shows how far it is.
         states: what to learn of the scene, as it was recorded, `[N, T, S]` on the device that
             trains; S is 0 if there is nothing.
+        weights: how much the frame counts that each action leads to, `[N, T]`, 0 or more; None if
+            all count alike.
     """
 
     @property
@@ -36,6 +38,9 @@ class TrainingClips(Protocol):
 
     @property
     def states(self) -> Tensor: ...  # noqa: D102
+
+    @property
+    def weights(self) -> Tensor | None: ...  # noqa: D102
 
     def state_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the states over all training episodes, `[S]` each.
@@ -73,6 +78,7 @@ class Objective(ABC, Generic[ModelT]):
         inputs: further latents or levels that it gives a denoiser, by name (`Denoiser.inputs`).
         steps: default number of network evaluations per prediction; None if there is no choice.
         learns_states: whether it trains on states of the scene, too; see `Batch.states`.
+        weighs_frames: whether its loss heeds `Batch.weights`.
     """
 
     trains: type[ModelT]
@@ -80,6 +86,7 @@ class Objective(ABC, Generic[ModelT]):
     inputs: Mapping[str, InputKind] = {}
     steps: int | None = None
     learns_states: bool = False
+    weighs_frames: bool = False
 
     def prepare(self, model: ModelT, clips: TrainingClips, *, resumed: bool) -> None:
         """Prepare a model before the first step of a training. Optional.

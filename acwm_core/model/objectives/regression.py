@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from acwm_core.errors import RecipeError, check_shape
-from acwm_core.model.batch import Batch
+from acwm_core.model.batch import Batch, weighed
 from acwm_core.model.dynamics import DynamicsModel, LatentStream, Predictor
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Latent
@@ -31,6 +31,7 @@ class Regression(Objective[Predictor]):
     """
 
     trains = Predictor
+    weighs_frames = True
 
     def __init__(self, *, frames: int | None = None) -> None:
         if frames is not None and frames < 1:
@@ -51,7 +52,13 @@ class Regression(Objective[Predictor]):
         numbers = self.compared_frames(model, batch, known)
         beginning = replace(batch, latents=batch.latents[:, :known])
         predicted = _predicted(model, beginning, batch.latents.shape[1], numbers)
-        return functional.mse_loss(predicted.float(), frames_of(batch, known, numbers).float())
+        true = frames_of(batch, known, numbers)
+        if batch.weights is None:
+            return functional.mse_loss(predicted.float(), true.float())
+        errors = (predicted.float() - true.float()).square().flatten(2).mean(2)
+        weights = batch.weights[:, known:]
+        compared = weights if numbers is None else weights.take_along_dim(numbers, 1)
+        return weighed(errors, compared).mean()
 
     def predict(
         self, model: Predictor, given: Batch, frames: int, steps: int | None = None
