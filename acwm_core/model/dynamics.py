@@ -360,6 +360,25 @@ class LatentStream(ABC):
                 a conditioner may look one step ahead.
         """
 
+    def keypoints(self) -> Keypoints | None:
+        """The things that `move_keypoint` can move, as they are now: L is 1. Optional; else None.
+
+        They may be fewer than those of `Predictor.keypoint_names`.
+        """
+        return None
+
+    def move_keypoint(self, number: int, place: Tensor) -> None:
+        """Move a thing to another place in the picture, from where it continues. Optional.
+
+        Args:
+            number: of the keypoint in `keypoints`.
+            place: right and down, `[2]`, each from -1 to 1.
+
+        Raises:
+            RecipeError: things of this model cannot be moved.
+        """
+        raise RecipeError(f"{type(self).__name__} cannot move things")
+
 
 class CarriedStates(ABC):
     """The states of B scenes side by side, which actions move, in constant memory.

@@ -10,7 +10,7 @@ import torch
 from acwm_core.errors import RecipeError, ShapeError
 from acwm_core.model.codec import Codec
 from acwm_core.model.conditioner import Conditioner, Conditioning
-from acwm_core.model.dynamics import DynamicsModel
+from acwm_core.model.dynamics import DynamicsModel, Keypoints
 from acwm_core.model.objectives.objective import Objective
 from acwm_core.model.shapes import Actions, Latent, Video, float32_by_default
 
@@ -127,6 +127,30 @@ class Stream:
             filled = continued(rows, -rows.shape[1] % stride)
             latents = [self._advance(step, check) for step in torch.split(filled, stride, 1)]
             yield self._decode(torch.cat(latents, 1))[:, : rows.shape[1]]
+
+    def keypoints(self) -> Keypoints | None:
+        """The things that can be moved, as they are in the last frame; None if none can be."""
+        with torch.inference_mode():
+            return self._latents.keypoints()
+
+    def move_keypoint(self, number: int, place: Sequence[float]) -> None:
+        """Move a thing that the model sees, such as a learnt point; the next frame shows it there.
+
+        Args:
+            number: of the keypoint in `keypoints`.
+            place: right and down, each from -1 to 1 in the picture.
+
+        Raises:
+            RecipeError: there is no such thing, or the place is outside the picture.
+        """
+        keypoints = self.keypoints()
+        count = 0 if keypoints is None else keypoints.values.shape[2]
+        if not 0 <= number < count:
+            raise RecipeError(f"this model has {count} things to move, so none of number {number}")
+        if len(place) != 2 or not all(-1 <= part <= 1 for part in place):
+            raise RecipeError(f"a place is two numbers from -1 to 1, not {list(place)}")
+        with torch.inference_mode():
+            self._latents.move_keypoint(number, torch.tensor(place, device=self.given.device))
 
     def _advance(self, actions: Actions, check: bool) -> Latent:
         """Predict the latent frame that the actions of one latent step lead to."""

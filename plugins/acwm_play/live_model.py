@@ -13,6 +13,7 @@ from acwm_core.data.pictures import to_pixels
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.errors import RecipeError, ShapeError, noting
 from acwm_core.evaluation.clips import as_clip
+from acwm_core.evaluation.tracks import LEAST_SHARE
 from acwm_core.model.stream import Stream
 from acwm_core.model.world_model import WorldModel
 
@@ -94,6 +95,29 @@ class LiveModel:
                 )
         self.spread = self.doubt = None
         return to_pixels(self._stream.given[0, -1:])[0]
+
+    @property
+    def keypoints(self) -> list[tuple[int, float, float]]:
+        """Number and place, right and down from 0 to 1, of the things that can be moved."""
+        keypoints = self._stream.keypoints()
+        if keypoints is None:
+            return []
+        places, shares = (keypoints.values[0, 0, :, :2] + 1) / 2, keypoints.shares
+        return [
+            (number, *(round(float(part), 4) for part in place))
+            for number, (place, share) in enumerate(zip(places, shares, strict=True))
+            if share >= LEAST_SHARE and bool(place.isfinite().all())
+        ]
+
+    def move(self, number: int, place: Sequence[float]) -> None:
+        """Move one of `keypoints` to a place in the picture, from 0 to 1, in all samples.
+
+        Raises:
+            RecipeError: there is no such thing.
+        """
+        inside = [2 * min(max(part, 0.0), 1.0) - 1 for part in place]
+        for stream in filter(None, (self._stream, self._others)):
+            stream.move_keypoint(number, inside)
 
     def step(self, actions: Sequence[NDArray[np.float32]]) -> Frames:
         """Predict the frames `[stride, H, W, 3]` uint8 for `stride` raw actions."""

@@ -41,8 +41,8 @@ class LiveWorld:
         scene: the scene that was started last.
         recent: the simulator's last time steps in this scene, at most `MEMORY` or as many as the
             model starts from.
-        apart: whether the model got other actions than a recorded video beside it since both showed
-            the same, so that they cannot be compared.
+        apart: whether they cannot be compared, since the model got other actions than a recorded
+            video beside it, or a person moved what it sees.
     """
 
     world: World
@@ -98,7 +98,7 @@ class LiveWorld:
 
     async def act(self, action: NDArray[np.float32]) -> TimeStep:
         """Advance the simulator by one frame."""
-        self.apart = self.recorded
+        self.apart |= self.recorded
         self.recent.append(await self.simulator.step(action))
         return self.recent[-1]
 
@@ -106,6 +106,11 @@ class LiveWorld:
         """Advance the simulator by one frame with its behaviour policy."""
         self.recent.append(await self.simulator.step_by_policy(anew))
         return self.recent[-1]
+
+    async def move(self, number: int, place: list[float]) -> None:
+        """Move something that the model sees to a place in the picture."""
+        await self.workers.run("model", self.model.move, number, place)
+        self.apart = True
 
     async def predict(self, actions: list[NDArray[np.float32]]) -> NDArray[np.uint8]:
         """The model's frames for the actions of one latent frame."""

@@ -45,6 +45,14 @@ class Point:
 
 
 @dataclass(frozen=True)
+class Move:
+    """Move a thing that the model sees to a place in the picture; see `LiveModel.keypoints`."""
+
+    number: int
+    place: list[float]
+
+
+@dataclass(frozen=True)
 class Open:
     """Open another world, or another scene of the same world; a new scene without an index."""
 
@@ -100,11 +108,12 @@ class Record:
 ServerMessage = Literal["world", "state", "figures", "busy", "notice", "goal", "attempt"]
 """Types of the server's JSON messages."""
 
-PageMessage = Act | Point | Open | TakeOver | Redraw | Pause | Step | Speed | Drive | Record
+PageMessage = Act | Point | Move | Open | TakeOver | Redraw | Pause | Step | Speed | Drive | Record
 
 PAGE_MESSAGES: Mapping[str, type[Any]] = {
     **{"act": Act, "point": Point, "open": Open, "take_over": TakeOver, "pause": Pause},
     **{"step": Step, "speed": Speed, "drive": Drive, "record": Record, "redraw": Redraw},
+    "move": Move,
 }
 
 

@@ -49,6 +49,7 @@ class Session:
         self._live: LiveWorld | None = None
         self._request: messages.Open | None = None
         self._take_over = self._redraw = False
+        self._moves: dict[int, list[float]] = {}
         self._last: tuple[TimeStep, NDArray[np.uint8]] | None = None
         self._alone = 0
         self._recording: PlayedEpisode | None = None
@@ -67,6 +68,8 @@ class Session:
         """Note what the page asks for; the loop acts on it with the next frame."""
         if isinstance(message, messages.Act | messages.Point):
             self._source.hold(message)
+        elif isinstance(message, messages.Move):
+            self._moves[message.number] = message.place
         else:
             self._note(message)
             self._wake.set()
@@ -186,7 +189,7 @@ class Session:
 
     def _show_start(self, time_step: TimeStep, frame: NDArray[np.uint8]) -> None:
         """Show the start, where simulator and model show the same."""
-        self._last, self._alone = (time_step, frame), 0
+        self._last, self._alone, self._moves = (time_step, frame), 0, {}
         self._show([time_step], frame[None], [self._source.seq])
         self._tell_state()
 
@@ -214,6 +217,9 @@ class Session:
             await task
 
     async def _predict(self, live: LiveWorld, time_steps: list[TimeStep], seqs: list[int]) -> None:
+        moves, self._moves = self._moves, {}
+        for number, place in moves.items():
+            await live.move(number, place)
         frames = await live.predict([time_step.action for time_step in time_steps])
         self._alone += len(time_steps)
         if self._recording:
@@ -261,6 +267,7 @@ class Session:
             "pace": self._pace,
             "pixel_error": None if live.apart else pixel_error(frames[-1], time_steps[-1].frame),
             "spread": live.model.spread,
+            "keypoints": live.model.keypoints,
             "dropped": self.outbox.dropped,
             "recorded": self._recording.frames if self._recording else 0,
             "progress": dataclasses.asdict(progress) if progress else None,

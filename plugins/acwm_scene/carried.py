@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from acwm_core.model.conditioner import Conditioning
-from acwm_core.model.dynamics import CarriedStates, LatentStream
+from acwm_core.model.dynamics import CarriedStates, Keypoints, LatentStream
 from acwm_core.model.shapes import Latent
 from acwm_scene.group import tree_map
 
@@ -28,6 +28,19 @@ class SceneStream(LatentStream):
         """The next latent frame; see `LatentStream.advance`."""
         latent, self._scene = self._model.next_frame(self._scene, conditioning)
         return latent
+
+    def keypoints(self) -> Keypoints | None:
+        """The learnt points; what is declared cannot be moved."""
+        points = self._model.points
+        if points is None:
+            return None
+        return points.keypoints(points.frame(self._scene.states["points"])[:, None], 1.0)
+
+    def move_keypoint(self, number: int, place: Tensor) -> None:
+        """See `LatentStream.move_keypoint`."""
+        assert self._model.points is not None
+        moved = self._model.points.moved_to(self._scene.states["points"], number, place)
+        self._scene = self._scene._replace(states=self._scene.states | {"points": moved})
 
 
 class SceneStates(CarriedStates):

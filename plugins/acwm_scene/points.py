@@ -127,6 +127,12 @@ class PointGroup(Group):
         costs = (self.weight * self.motion.std).norm(dim=1)
         return Keypoints(course, self.weight, costs / costs.max().clamp(min=1e-9))
 
+    def moved_to(self, state: Points, number: int, place: Tensor) -> Points:
+        """The state in which a point is at another place `[2]`, as if it had been pushed there."""
+        change = torch.zeros_like(state.points)
+        change[:, number, :2] = place - state.points[:, number, :2]
+        return state._replace(points=state.points + change, pushed=state.pushed + change)
+
     def embed(self, modulation: Tensor) -> Tensor:
         """Embedded actions by latent frames; see `PointMotion.embed`."""
         return self.motion.embed(modulation)

@@ -11,7 +11,7 @@ from torch import nn
 
 from acwm_core.data.card import DatasetCard
 from acwm_core.env.environment import resolve_size
-from acwm_core.model.dynamics import LatentStream, Predictor
+from acwm_core.model.dynamics import Keypoints, LatentStream, Predictor
 from acwm_core.plugins import catalog
 from acwm_core.recipe import Recipe
 from tests import tiny
@@ -45,6 +45,14 @@ class Follower(Predictor):
 class _FollowerStream(LatentStream):
     def __init__(self, given):
         self._base = nn.functional.pixel_shuffle(given[:, -1], 8)  # [B, 4 · 3, H, W]
+        self._place = torch.zeros(2)  # of a thing that can be moved and is not drawn
+
+    def keypoints(self):
+        number = len(self._base)
+        return Keypoints(self._place.expand(number, 1, 1, 2), torch.ones(1, 2), torch.ones(1))
+
+    def move_keypoint(self, number, place):
+        self._place = place
 
     def advance(self, conditioning):
         frames = self._base.unflatten(1, (STRIDE, 3)).clone()

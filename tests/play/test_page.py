@@ -66,6 +66,24 @@ def test_dragging_in_a_picture_moves_it_there(page):
     seen(page, lambda: abs(dark(page) - 0.25) < 0.05 and abs(white(page) - 0.25) < 0.05)
 
 
+def test_a_point_is_dragged_to_another_place(page):
+    box = page.locator("#model").bounding_box()
+    page.keyboard.press("k")
+    until(page, "document.querySelectorAll('.model .dot').length === 1")
+    page.mouse.move(box["x"] + 0.52 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.7 * box["height"], steps=5)
+    page.mouse.up()
+    alone = float(page.evaluate("() => document.body.dataset.alone"))
+    until(page, f"Number(document.body.dataset.alone) > {alone + 1}")
+    at = page.evaluate("() => keypoints")  # as the server says
+    np.testing.assert_allclose(at, [[0, 0.2, 0.7]], atol=0.02)
+    until(page, "document.body.classList.contains('uncompared')")
+    page.keyboard.press("x")
+    until(page, "!document.body.classList.contains('uncompared')")
+    until(page, "keypoints[0][1] === 0.5")
+
+
 def test_a_finger_does_as_well(browser, served):
     context = browser.new_context(viewport=PHONE, has_touch=True, is_mobile=True)
     page = context.new_page()

@@ -7,12 +7,18 @@ import torch
 
 from acwm_core.env.camera import Camera
 from acwm_core.errors import RecipeError
+from acwm_core.model.dynamics import LatentStream
 from acwm_scene.declared import GroupSpec
 from acwm_scene.scene import SceneDynamics
 from tests.scene.dots import world_of
 from tests.scene.test_points import FRAMES, balls, model_of_balls
 
 CAMERA = Camera((0.0, -1.0, 2.0))
+
+
+class Still(LatentStream):
+    def advance(self, conditioning):
+        raise NotImplementedError
 
 
 def bodies(**parameters):
@@ -38,6 +44,32 @@ def test_points_are_those_that_it_reads_and_moves():
         for row in rows[:, 1:3].unbind(1):
             state, _ = model.points.move(state, row)
     torch.testing.assert_close(moved.values[:, 1], state.points)
+
+
+@torch.no_grad()
+def test_a_moved_point_continues_from_its_new_place():
+    model = model_of_balls(temporal_stride=2).eval()
+    world = world_of(model, stride=2, states=0)
+    latents, _, _ = balls(2, seed=0)
+    conditioning = world.condition(torch.rand(2, 2 * FRAMES - 1, 2), FRAMES)
+    streams = [model.stream(latents[:, :1], context=2) for _ in range(2)]
+    before = streams[0].keypoints().values
+    streams[1].move_keypoint(1, torch.tensor([0.5, -0.5]))
+    moved = streams[1].keypoints().values
+    torch.testing.assert_close(moved[:, 0, 1, :2], torch.tensor([[0.5, -0.5]] * 2))
+    assert moved[:, :, [0, 2, 3]].equal(before[:, :, [0, 2, 3]])
+    assert moved[:, :, 1, 2:].equal(before[:, :, 1, 2:])
+    drawn = [stream.advance(conditioning.frames(0, 2)) for stream in streams]
+    assert not drawn[0].allclose(drawn[1])
+    later = [stream.keypoints().values[:, 0, 1, :2] for stream in streams]
+    torch.testing.assert_close(later[1] - later[0], (moved - before)[:, 0, 1, :2], atol=0.1, rtol=0)
+
+
+def test_what_a_stream_cannot_move_is_refused():
+    scene = bodies().stream(torch.randn(1, 1, 2, 6, 12), context=2)
+    assert scene.keypoints() is None
+    with pytest.raises(RecipeError, match="cannot move things"):
+        Still().move_keypoint(0, torch.zeros(2))
 
 
 def test_a_share_is_what_drawing_cares_for():

@@ -179,6 +179,7 @@ function play(now) {
   draw($("sim"), frame.sim, frame);
   draw($("model"), frame.model, frame);
   if (frame.compared) draw($("diff"), difference(frame), frame);
+  if (frame.head) showPoints(frame.head.keypoints || []);
   if (frame.head) draw($("doubt"), heated(frame.doubt || new Uint8Array(frame.sim.length)), frame);
   document.body.classList.toggle("uncompared", !frame.compared);
   document.body.classList.remove("busy");
@@ -434,6 +435,36 @@ function rings(shown) {
   }
 }
 
+// Things that the model sees and that can be dragged: their numbers and places, in the model's picture.
+const NEAR = 0.12; // of the picture
+let keypoints = [], dragged = null;
+
+function showPoints(seen) {
+  const screen = document.querySelector(".model .screen");
+  if (!dragged) keypoints = seen;
+  $("points").hidden = !seen.length;
+  const shown = $("points").getAttribute("aria-pressed") === "true" ? keypoints : [];
+  while (screen.querySelectorAll(".dot").length > shown.length) screen.querySelector(".dot").remove();
+  while (screen.querySelectorAll(".dot").length < shown.length) screen.append(make("i", "", "dot"));
+  screen.querySelectorAll(".dot").forEach((dot, k) => {
+    const [number, x, y] = shown[k];
+    [dot.style.left, dot.style.top, dot.style.background] = [`${100 * x}%`, `${100 * y}%`, `hsl(${(47 * number) % 360} 85% 55%)`];
+  });
+}
+
+function nearestPoint([x, y]) {
+  if ($("points").getAttribute("aria-pressed") !== "true" || !keypoints.length) return null;
+  const far = (point) => Math.hypot(point[1] - x, point[2] - y);
+  const best = keypoints.reduce((a, b) => far(b) < far(a) ? b : a);
+  return far(best) < NEAR ? best : null;
+}
+
+function drag(point, here) {
+  [point[1], point[2]] = here.map((part) => clamp(part, 0, 1));
+  say("move", { number: point[0], place: [point[1], point[2]] });
+  showPoints(keypoints);
+}
+
 // What is asked for lies within the bounds of actions.
 function inReach(place, k) {
   const [from, to] = world.reach.map((each) => each[k]);
@@ -478,14 +509,20 @@ for (const screen of all(".screen[data-touch]")) {
     if (!world || event.button) return;
     event.preventDefault();
     screen.setPointerCapture(event.pointerId);
+    dragged = screen.closest(".model") ? nearestPoint(at(event)) : null;
+    if (dragged) return;
     mine();
     const here = at(event), far = (place) => Math.hypot(place[0] - here[0], place[1] - here[1]);
     grabbed = world.points ? places.reduce((best, place, k) => far(place) < far(places[best]) ? k : best, 0) : here;
     move(event);
   });
-  screen.addEventListener("pointermove", (event) => { if (grabbed !== null) move(event); });
+  screen.addEventListener("pointermove", (event) => {
+    if (dragged) drag(dragged, at(event));
+    else if (grabbed !== null) move(event);
+  });
   for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) {
     screen.addEventListener(kind, () => {
+      dragged = null;
       if (grabbed === null) return;
       grabbed = null;
       if (!world.points) { marks(false); lean(0, 0); }
@@ -508,7 +545,7 @@ for (const screen of all(".screen[data-touch]")) {
 
 // Keys --------------------------------------------------------------------------------------------
 
-const HOTKEYS = { KeyN: "new", KeyB: "same", KeyX: "take", KeyZ: "redraw", Space: "pause", Period: "step", KeyV: "record" };
+const HOTKEYS = { KeyN: "new", KeyB: "same", KeyX: "take", KeyZ: "redraw", KeyK: "points", Space: "pause", Period: "step", KeyV: "record" };
 const typing = (target) => target.matches("select, input[type=range], input[type=radio]");
 
 addEventListener("keydown", (event) => {
@@ -604,6 +641,10 @@ $("new").onclick = () => open(null, world.asked);
 $("same").onclick = () => open(world.index, world.asked);
 $("take").onclick = () => say("take_over");
 $("redraw").onclick = () => say("redraw");
+$("points").onclick = ({ currentTarget }) => {
+  currentTarget.setAttribute("aria-pressed", currentTarget.getAttribute("aria-pressed") !== "true");
+  showPoints(keypoints);
+};
 $("pause").onclick = () => say("pause", { on: !state.paused });
 $("step").onclick = () => say("step");
 $("record").onclick = () => say("record", { on: !state.recording });
