@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -104,9 +105,9 @@ class LiveModel:
             return []
         places, shares = (keypoints.values[0, 0, :, :2] + 1) / 2, keypoints.shares
         return [
-            (number, *(round(float(part), 4) for part in place))
-            for number, (place, share) in enumerate(zip(places, shares, strict=True))
-            if share >= LEAST_SHARE and bool(place.isfinite().all())
+            (number, round(x, 4), round(y, 4))
+            for number, ((x, y), share) in enumerate(zip(places.tolist(), shares, strict=True))
+            if share >= LEAST_SHARE and math.isfinite(x + y)
         ]
 
     def move(self, number: int, place: Sequence[float]) -> None:
