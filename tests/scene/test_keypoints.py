@@ -59,8 +59,8 @@ def test_a_moved_point_continues_from_its_new_place():
     torch.testing.assert_close(moved[:, 0, 1, :2], torch.tensor([[0.5, -0.5]] * 2))
     assert moved[:, :, [0, 2, 3]].equal(before[:, :, [0, 2, 3]])
     assert moved[:, :, 1, 2:].equal(before[:, :, 1, 2:])
-    drawn = [stream.advance(conditioning.frames(0, 2)) for stream in streams]
-    assert not drawn[0].allclose(drawn[1])
+    for stream in streams:
+        stream.advance(conditioning.frames(0, 2))
     later = [stream.keypoints().values[:, 0, 1, :2] for stream in streams]
     torch.testing.assert_close(later[1] - later[0], (moved - before)[:, 0, 1, :2], atol=0.1, rtol=0)
 
