@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -30,16 +30,18 @@ from acwm_planning.controllers import (
     RandomController,
     StillController,
 )
-from acwm_planning.episode import load_task, play, spec_of_seed, start_of
+from acwm_planning.episode import EpisodeResult, load_task, play, spec_of_seed, start_of
 from acwm_planning.futures import History
 from acwm_planning.left_out import LeftOut
-from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy, policy_for
+from acwm_planning.policies.saved import POLICY_FILE, SavedPolicy, policy_for, raw_actions
+from acwm_planning.results import VIDEOS
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_planning.rewards.task import RewardTask
 from acwm_planning.runner import EpisodeTable, play_missing
 from acwm_planning.table import EpisodeLine, summarise
 from acwm_policy.episodes import Episodes
 from acwm_policy.scenes import DreamScenes
+from acwm_policy.videos import write_video
 
 EVALUATION, EVALUATION_FILE = "evaluation", "evaluation.json"
 """Folder of the results within a policy's folder, and the file with the summary."""
@@ -81,6 +83,8 @@ class EvaluatedEpisodes(EpisodeTable):
         environment: the simulator with the task.
         rows: of `ROWS`.
         beside: another policy for the same task, for the row of that name.
+        videos: folder of the videos.
+        filmed: seeds that get a video of the policy.
     """
 
     def __init__(
@@ -90,9 +94,12 @@ class EvaluatedEpisodes(EpisodeTable):
         environment: TaskEnvironment,
         rows: Sequence[str],
         beside: SavedPolicy | None = None,
+        videos: Path = Path(VIDEOS),
+        filmed: Sequence[int] = (),
     ) -> None:
         super().__init__(rows)
         self._policy, self._bundle, self._environment = policy, bundle, environment
+        self._videos, self._filmed = videos, filmed
         repeat = policy.card.repeat
         self._controllers = {
             TRAINED: StateController(policy),
@@ -118,40 +125,59 @@ class EvaluatedEpisodes(EpisodeTable):
         return lines
 
     def _facts(self, row: str, seed: int) -> dict[str, Any]:
+        if row == DREAM:
+            return self._dream(seed)[0].facts
         spec = spec_of_seed(self._bundle.card, seed)
-        if row != DREAM:
-            return play(self._environment, spec, self._controllers[row]).facts()
-        given = self._bundle.world_model.context_frames
+        result = play(self._environment, spec, self._controllers[row])
+        if row == TRAINED and seed in self._filmed:
+            self._film(seed, result)
+        return result.facts()
+
+    def _dream(self, seed: int) -> tuple[Dreamt, DreamStart]:
+        spec, given = spec_of_seed(self._bundle.card, seed), self._bundle.world_model.context_frames
         start = start_of(self._environment, spec, given=given)
         actions = np.array(start.history.actions, np.float32)
         actions = actions.reshape(given - 1, self._bundle.card.action.size)
-        frames = np.stack(start.history.frames)
-        return dream(
-            self._policy,
-            self._bundle,
-            self._environment.task,
-            DreamStart(frames, actions, start.goal),
-        )
+        begun = DreamStart(np.stack(start.history.frames), actions, start.goal)
+        return dream(self._policy, self._bundle, self._environment.task, begun), begun
+
+    def _film(self, seed: int, result: EpisodeResult) -> None:
+        path = self._videos / f"{TRAINED}-{seed:04d}.mp4"
+        start, decided = None, list[Tensor]()
+        if DREAM in self.rows:
+            dreamt, start = self._dream(seed)
+            decided = dreamt.decided
+        parts = self._bundle, self._environment.task, start, decided
+        write_video(path, TRAINED, seed, result, *parts)
 
 
-def dream(policy: SavedPolicy, bundle: RunBundle, task: Task, start: DreamStart) -> dict[str, Any]:
-    """The facts of an episode of the policy in the model, as those of one in the simulator."""
+class Dreamt(NamedTuple):
+    """An episode in a model: its facts, as of one in the simulator, and the raw actions `[A]`."""
+
+    facts: dict[str, Any]
+    decided: list[Tensor]
+
+
+def dream(policy: SavedPolicy, bundle: RunBundle, task: Task, start: DreamStart) -> Dreamt:
+    """An episode of the policy in the model."""
     scenes = DreamScenes(bundle.world_model, [start], 1)
     episodes = Episodes(scenes, task, bundle.card, policy.card.inputs, unit=1.0, bonus=0.0)
-    vectors, decided = episodes.begin([0]), list[Tensor]()
+    vectors, next_ones, taken = episodes.begin([0]), list[Tensor](), list[Tensor]()
     begun = float(episodes.distances[0])
     for _ in range(-(-task.max_steps // scenes.repeat)):
-        decided = decided or [*policy.scaled(vectors).unbind(1)]
-        step = episodes.step(decided.pop(0))
+        next_ones = next_ones or [*policy.scaled(vectors).unbind(1)]
+        taken.append(raw_actions(next_ones[0][0], bundle.card.action.low, bundle.card.action.high))
+        step = episodes.step(next_ones.pop(0))
         vectors = step.vectors
         if step.over[0]:
-            return {
+            facts: dict[str, Any] = {
                 "success": bool(step.solved[0]),
                 "failed": bool(step.failed[0]),
                 "steps": int(step.frames[0]),
                 "start_distance": begun,
                 "distance": begun - float(step.returns[0]),
             }
+            return Dreamt(facts, taken)
     raise RecipeError(f"the task {task.name!r} does not end")
 
 
@@ -162,6 +188,7 @@ def evaluate_policy(
     run: str | Path | None = None,
     beside: Path | None = None,
     rows: Sequence[str] = ROWS,
+    videos: int = 0,
     out: Path | None = None,
     device: str = "auto",
     progress: bool = False,
@@ -174,6 +201,7 @@ def evaluate_policy(
         run: the model to dream in; by default the one that the policy was trained with.
         beside: folder of another policy for the same task, to compare with.
         rows: those of `ROWS` to play.
+        videos: number of seeds, from the first, of which a video of the policy is written.
         out: folder of the results; `EVALUATION` within `folder` by default.
         device: device of the model.
         progress: show a progress bar.
@@ -213,7 +241,8 @@ def evaluate_policy(
         without = {DREAM} if not dreams(bundle, policy) else set[str]()
         without |= {BESIDE} if other is None else set()
         played = [row for row in ROWS if row in rows and row not in without]
-        table = EvaluatedEpisodes(policy, bundle, environment, played, other)
+        films = where / VIDEOS, seeds[:videos]
+        table = EvaluatedEpisodes(policy, bundle, environment, played, other, *films)
         results = ResumableResults(where, identity, kind=EpisodeLine)
         with results.adding():
             label = f"evaluating at {task.name}" if progress else ""

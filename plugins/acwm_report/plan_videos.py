@@ -51,6 +51,7 @@ class PlanVideo:
     task: str
     curves: EpisodeCurves
     source: str  # the MP4 file: its path from the page, or a data URL
+    apart: str = "model error"  # what the distance between the two curves is
 
     @property
     def outcome(self) -> str:
@@ -60,12 +61,12 @@ class PlanVideo:
 
     @property
     def gap(self) -> str:
-        """The largest error of the model in words; empty if it is not known."""
+        """The largest distance between the curves in words; empty if it is not known."""
         widest, scale = self.curves.widest_gap, distance_scale(self.curves.unit)
         if widest is None:
             return ""
         frame, gap = widest
-        return f"model error up to {scale.number(gap)} {scale.unit}, after {frame} actions"
+        return f"{self.apart} up to {scale.number(gap)} {scale.unit}, after {frame} actions"
 
     @property
     def drawing(self) -> CurveDrawing:
@@ -124,7 +125,7 @@ class VideoRoom:
         return chosen
 
 
-def linked_videos(folder: Path, row: str, task: str) -> list[PlanVideo]:
+def linked_videos(folder: Path, row: str, task: str, apart: str = "model error") -> list[PlanVideo]:
     """The videos of one way to act, for a page in the folder of results that links to them."""
     videos: list[PlanVideo] = []
     for path in sorted((folder / VIDEOS).glob(f"{row}-*.json")):
@@ -134,7 +135,7 @@ def linked_videos(folder: Path, row: str, task: str) -> list[PlanVideo]:
         except DataError as error:
             warnings.warn(f"{error}: its video is not shown", AcwmWarning, stacklevel=2)
         else:
-            videos.append(PlanVideo(path.stem, task, curves, source))
+            videos.append(PlanVideo(path.stem, task, curves, source, apart))
     return videos
 
 

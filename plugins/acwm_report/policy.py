@@ -17,18 +17,6 @@ POLICY = ExistingFolder(
     "policy's folder", "policy.safetensors", "`acwm policy train ENVIRONMENT.TASK`"
 )
 
-NAMES = {
-    "trained": "trained policy",
-    "dream": "the same, in the dream",
-    "beside": "the policy beside it",
-    "solution": "script that knows the goal",
-    "behaviour": "behaviour policy",
-    "random": "random actions",
-    "still": "no motion",
-}
-"""What the rows of the table are called."""
-
-
 RECIPE_SECTIONS = ("training.", "trainer.", "data.", "objective.")
 """With what an override of a model's recipe begins."""
 
@@ -204,6 +192,7 @@ def improve(task: str, words: tuple[str, ...], out: Path | None, **options: Any)
     metavar="POLICY",
     help="Another policy for the task to compare with, e.g. one trained in the simulator.",
 )
+@click.option("--videos", default=3, help="Number of episodes to write videos of.")
 @click.option("--out", type=OUT_FOLDER, help="Folder of the results; POLICY/evaluation by default.")
 @click.option("--device", default="auto", help="Device of the model.")
 def evaluate(folder: Path, **options: Any) -> None:
@@ -213,49 +202,22 @@ def evaluate(folder: Path, **options: Any) -> None:
     random actions, no motion, the behaviour policy that collects data, and the script that knows
     the goal if the task has one; and the policy in the model. How much better it is there
     is the gap: what it gains from errors of the model. The policy observes the states of the
-    simulator. If it is interrupted, run the same command again to continue.
+    simulator. Writes a page with the table, what was logged in training, and videos. If it is
+    interrupted, run the same command again to continue.
     """
-    from acwm_policy.evaluate import evaluate_policy
+    from acwm_policy.evaluate import EVALUATION, evaluate_policy
+    from acwm_report.policy_page import PAGE_FILE, gap_text, write_policy_page
 
     results = evaluate_policy(folder, progress=True, **options)
-    print_evaluation(results)
-    click.echo(options["out"] or folder / "evaluation")
-
-
-def print_evaluation(results: dict[str, Any]) -> None:
-    """Print the table of `evaluate_policy`."""
-    from rich.console import Console
-
-    from acwm_core.cli.tables import print_table
-
-    def share(row: dict[str, Any]) -> str:
-        estimate = row["success"]
-        low, high = estimate["low"], estimate["high"]
-        return f"{estimate['value']:.0%} [{low:.0%}, {high:.0%}]"
-
-    rows = [
-        (
-            NAMES[row["row"]],
-            [
-                f"{row['successes']}/{row['episodes']}",
-                share(row),
-                f"{row['distance']['value']:.3g} {results['unit']}".strip(),
-                "" if row["p"] is None else f"{row['p']:.2g}",
-            ],
-        )
-        for row in results["rows"]
-    ]
-    title = f"{results['environment']}.{results['task']}"
+    where = options["out"] or folder / EVALUATION
     if "held_out" in results:
         click.echo(f"error of the reward: {results['held_out']}")
-    headings = ("solved", "share, 95 %", "final distance", "p")
-    print_table(Console(highlight=False, markup=False), title, headings, rows)
-    gap = results["gap"]
-    if gap is None:
+    print_page_table(write_policy_page(folder, where, results, options["beside"]))
+    if results["gap"] is None:
         click.echo(
             "no row in the dream: the model does not predict all that the policy observes, or "
             "moves at another rate (observe=[…] chooses fields)"
         )
-        return
-    about = "" if gap["low"] is None else f" [{gap['low']:+.0%}, {gap['high']:+.0%}]"
-    click.echo(f"gap (dream − simulator): {gap['mean']:+.0%}{about}")
+    else:
+        click.echo(f"gap (dream − simulator): {gap_text(results['gap'])}")
+    click.echo(where / PAGE_FILE)

@@ -2,6 +2,7 @@
 
 import json
 
+import av
 import numpy as np
 import pytest
 
@@ -51,8 +52,34 @@ def test_the_best_policy_solves_what_can_be_solved(run, policy, capsys):
     won = {(each["row"], each["seed"]): each["success"] for each in map(json.loads, lines)}
     gaps = [won["dream", seed] - float(won["trained", seed]) for seed in range(8)]
     assert found["gap"]["mean"] == pytest.approx(paired_bootstrap(gaps).mean)
-    assert "the same, in the dream" in said
+    assert "The same in the dream" in said
     assert f"{len(can)}/8" in said
+    page = (policy / "evaluation" / "index.html").read_text()
+    assert f"<dd>{len(can)}/8</dd>" in page
+    assert page.count("<video") == 3
+
+
+def test_a_video_has_the_dream_of_the_same_policy_beside_the_simulator(run, policy):
+    """The model is exact, so its pictures and distances are those of the simulator."""
+    from acwm_policy.evaluate import evaluate_policy
+
+    evaluate_policy(policy, seeds=[2], run=run, rows=("trained", "dream"), videos=1, device="cpu")
+    folder = policy / "evaluation" / "videos"
+    curves = json.loads((folder / "trained-0002.json").read_text())
+    assert curves["panels"] == ["simulator", "dream", "goal"]
+    length = len(curves["distances"])
+    assert length > 4
+    np.testing.assert_allclose(curves["imagined"][:length], curves["distances"], atol=2.1)
+    with av.open(str(folder / "trained-0002.mp4")) as file:
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert len(frames) == length
+    side, width = frames[0].shape[:2]
+    dream = (width - side) // 2  # the middle one of three panels
+    for frame in frames:
+        truth, dreamt = (
+            np.argwhere(frame[:, left : left + side, 0] > 130).mean(0) for left in (0, dream)
+        )
+        assert np.abs(truth - dreamt).max() < side * 2 / 32  # of 32 px
 
 
 @needs("stable_baselines3")
