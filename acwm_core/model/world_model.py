@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
@@ -489,8 +490,13 @@ class WorldModel(nn.Module):
 
 
 def _generators(given: Video, batch: int, seeds: Sequence[int] | None) -> list[torch.Generator]:
-    """One noise generator per batch element, from its seed."""
-    chosen = range(batch) if seeds is None else seeds
+    """One noise generator per batch element, from its seed; NumPy's and PyTorch's are taken, too."""
+    try:
+        chosen = [*map(operator.index, range(batch) if seeds is None else seeds)]
+    except TypeError:
+        raise ShapeError(f"seeds are a whole number per batch element, not {seeds!r:.60}") from None
+    if too_large := next((seed for seed in chosen if not -(2**63) <= seed < 2**64), None):
+        raise ShapeError(f"the seed {too_large} has more than 64 bits: give a smaller one")
     if not len(given) == batch == len(chosen):
         raise ShapeError(
             f"{len(given)} first frames for {batch} action sequences and {len(chosen)} seeds"

@@ -1,5 +1,6 @@
 """The world model and the codec's public side, on real tiny parts."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -134,6 +135,19 @@ def test_a_short_training_learns_what_actions_do():
     right = (world.rollout(video[:, 0], push) - video).square().mean()
     swapped = (world.rollout(video[:, 0], push.flip(0)) - video).square().mean()
     assert right < 0.3 * swapped
+
+
+@pytest.mark.parametrize("seeds", [np.array([7, 8]), torch.tensor([7, 8]), (7, np.uint8(8))])
+def test_seeds_may_be_those_of_numpy_and_pytorch(seeds):
+    world = pointwise_world_model()
+    same = world.rollout(first_frame(), actions(), seeds=[7, 8])
+    assert torch.equal(world.rollout(first_frame(), actions(), seeds=seeds), same)
+
+
+@pytest.mark.parametrize("seeds", [5, "78", 7.5, np.array([7.0, 8.0]), [7, None], [7, 2**64]])
+def test_seeds_that_are_none_are_refused(seeds):
+    with pytest.raises(ShapeError, match="whole number per batch element|more than 64 bits"):
+        pointwise_world_model().rollout(first_frame(), actions(), seeds=seeds)
 
 
 def test_wrong_shapes_are_refused_with_a_sentence():

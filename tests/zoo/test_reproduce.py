@@ -61,10 +61,15 @@ def few(line, learns_motion):
     return command, words
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("name", ["push_cube_draws", "reacher"])
+def quick_first(names):
+    """All models, of which `.ci/run` takes two, of bodies with draws and of values."""
+    others = [pytest.param(n, marks=pytest.mark.slow) for n in shipped() if n not in names]
+    return [*(pytest.param(name, marks=pytest.mark.ci) for name in names), *others]
+
+
+@pytest.mark.parametrize("name", quick_first(["push_cube_draws", "reacher"]))
 def test_every_printed_command_runs(name, tmp_path, monkeypatch):
-    """On little data, in few steps; of bodies with draws, and of values."""
+    """On little data, in few steps."""
     monkeypatch.chdir(tmp_path)
     lines = printed(name)
     recipe = RunFolder(folder(name)).recipe.read_text("utf-8")
