@@ -490,7 +490,7 @@ class WorldModel(nn.Module):
 
 
 def _generators(given: Video, batch: int, seeds: Sequence[int] | None) -> list[torch.Generator]:
-    """One noise generator per batch element, from its seed; NumPy's and PyTorch's are taken, too."""
+    """One noise generator per batch element, from its seed, which may be NumPy's or PyTorch's."""
     try:
         chosen = [*map(operator.index, range(batch) if seeds is None else seeds)]
     except TypeError:

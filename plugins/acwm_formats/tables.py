@@ -82,6 +82,8 @@ def read_table(path: Path) -> Table:
             _check_width(len(columns))
     except FileNotFoundError:
         raise DataError(f"there is no {path}") from None
+    except UnicodeDecodeError:
+        raise DataError(f"the table {path} is not in UTF-8: save it in UTF-8") from None
     except (*DAMAGED, arrow.ArrowException) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise DataError(f"the table {path} cannot be read ({reason})") from error
@@ -262,13 +264,21 @@ def _csv(path: Path) -> dict[str, Any]:
     _check_head(head)
     _check_delimiter(data, delimiter)
     commas = delimiter == b";" and _DECIMAL_COMMA.search(data) and not _DECIMAL_POINT.search(data)
-    table = csv.read_csv(
-        arrow.BufferReader(data),
-        parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
-        convert_options=csv.ConvertOptions(
-            strings_can_be_null=True, decimal_point="," if commas else "."
-        ),
-    )
+    try:
+        table = csv.read_csv(
+            arrow.BufferReader(data),
+            parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
+            convert_options=csv.ConvertOptions(
+                strings_can_be_null=True, decimal_point="," if commas else "."
+            ),
+        )
+    except arrow.ArrowInvalid as error:
+        if ragged := re.search(r"Expected (\d+) columns, got (\d+)", str(error)):
+            raise ValueError(
+                f"its first line has {ragged[1]} fields, and another one {ragged[2]}: remove what "
+                "stands above the names of the columns, or begin it with #"
+            ) from error
+        raise
     columns = _columns(table)
     _check_names(columns)
     return columns
@@ -287,18 +297,18 @@ def _utf8(data: bytes) -> bytes:
 def _without_comments(data: bytes) -> tuple[bytes, bytes]:
     """The lines of a CSV file but for comments, and its delimiter.
 
-    A comment begins with #, and has other fields than the header. The last one before the numbers
+    A comment begins with #, and has a space after it or other fields than the header. The last one before the numbers
     is the header if it has as many fields as they, as `numpy.savetxt` writes it.
     """
     data = data.lstrip(b"\r\n")
     separator = data[4:5] if data[:4].lower() == b"sep=" else b""  # a first line for Excel
-    if not separator and not re.search(rb"(^|[\r\n])#", data):
+    if not separator and not re.search(rb"(^|[\r\n])[ \t]*#", data):
         return data, max(DELIMITERS, key=re.split(rb"[\r\n]", data, maxsplit=1)[0].count)
     lines, comments = data.splitlines(), list[bytes]()
     if separator:
         lines.pop(0)
-    while lines and (lines[0].startswith(b"#") or not lines[0].strip()):
-        comments.append(lines.pop(0).lstrip(b"# "))
+    while lines and (lines[0].lstrip().startswith(b"#") or not lines[0].strip()):
+        comments.append(lines.pop(0).lstrip(b"# \t"))
     if not lines:
         return data, b","
     delimiter = separator or max(DELIMITERS, key=lines[0].count)
@@ -306,8 +316,14 @@ def _without_comments(data: bytes) -> tuple[bytes, bytes]:
     header = next((comment for comment in reversed(comments) if comment.strip()), b"")
     if header.count(delimiter) == count and all(map(_is_number, lines[0].split(delimiter))):
         lines.insert(0, header)
-    kept = (line for line in lines if line[:1] != b"#" or line.count(delimiter) == count)
+    kept = (line for line in lines if not _is_comment(line, delimiter, count))
     return b"\n".join(kept), delimiter
+
+
+def _is_comment(line: bytes, delimiter: bytes, count: int) -> bool:
+    """Whether a line is one, and no row whose first field is a text such as #ff0000."""
+    text = line.lstrip()
+    return text[:1] == b"#" and (text[1:2].isspace() or text.count(delimiter) != count)
 
 
 def _check_delimiter(data: bytes, delimiter: bytes) -> None:

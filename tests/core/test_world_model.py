@@ -146,7 +146,7 @@ def test_seeds_may_be_those_of_numpy_and_pytorch(seeds):
 
 @pytest.mark.parametrize("seeds", [5, "78", 7.5, np.array([7.0, 8.0]), [7, None], [7, 2**64]])
 def test_seeds_that_are_none_are_refused(seeds):
-    with pytest.raises(ShapeError, match="whole number per batch element|more than 64 bits"):
+    with pytest.raises(ShapeError, match=r"whole number per batch element|more than 64 bits"):
         pointwise_world_model().rollout(first_frame(), actions(), seeds=seeds)
 
 

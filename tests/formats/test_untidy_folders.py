@@ -85,6 +85,8 @@ TEXTS = {
     "comments between": PLAIN_TEXT.replace("0.1", "# a pause\n0.1"),
     "a header of numpy": "# time,x,y\n0,1,2\n0.1,3,4\n",
     "comments and a header of numpy": "# by hand\n#time,x,y\n0,1,2\n0.1,3,4\n# the end\n",
+    "comments with as many fields": f"{PLAIN_TEXT}# stopped, by hand, at 3\n",
+    "comments after a space": f"  # by hand\n{PLAIN_TEXT}\t# the end\n",
     "a comment like a header": f"# one, two, three\n{PLAIN_TEXT}",
     "a separator for Excel": f"sep=;\n{PLAIN_TEXT.replace(',', ';')}",
     "decimal commas": PLAIN_TEXT.replace(",", ";").replace(".", ","),
@@ -99,6 +101,20 @@ def test_tables_as_programs_write_them(tmp_path, text):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     found = {name: column.tolist() for name, column in read_table(path).items()}
     assert found == {"time": [0, 0.1], "x": [1, 3], "y": [2, 4]}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (f"Recorder 2\n{PLAIN_TEXT}".encode(), "first line has 1 fields, and another one 3: remo"),
+        (f"% by hand\n{PLAIN_TEXT}".encode(), "first line has 1 fields, and another one 3: remo"),
+        (PLAIN_TEXT.replace("x", "höhe").encode("latin-1"), "is not in UTF-8: save it in UTF-8"),
+    ],
+)
+def test_tables_that_need_an_edit_say_which(tmp_path, text, why):
+    (tmp_path / "a.csv").write_bytes(text)
+    with pytest.raises(DataError, match=why):
+        read_table(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize("text", ["0,1,push\n1,2,push\n2,0,pull\n", "push;3\npull;4\n"])
