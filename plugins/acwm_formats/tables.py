@@ -297,8 +297,8 @@ def _utf8(data: bytes) -> bytes:
 def _without_comments(data: bytes) -> tuple[bytes, bytes]:
     """The lines of a CSV file but for comments, and its delimiter.
 
-    A comment begins with #, and has a space after it or other fields than the header. The last one before the numbers
-    is the header if it has as many fields as they, as `numpy.savetxt` writes it.
+    A comment begins with #, and has a space after it or other fields than the header. The last one
+    before the numbers is the header if it has as many fields as they, as `numpy.savetxt` writes it.
     """
     data = data.lstrip(b"\r\n")
     separator = data[4:5] if data[:4].lower() == b"sep=" else b""  # a first line for Excel
