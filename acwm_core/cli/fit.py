@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from acwm_core.cli.arguments import OUT_FOLDER, RUN, Dataset
-from acwm_core.errors import RecipeError, TrainingError, few
+from acwm_core.errors import DataError, RecipeError, TrainingError, few
 from acwm_core.training.threads import wait_without_spinning
 
 if TYPE_CHECKING:
@@ -59,9 +59,11 @@ def fit(recipe: str, overrides: tuple[str, ...], out: Path | None) -> None:
     if composed.env:
         generate = shlex.join(["acwm", "generate", composed.env.name, "--out", str(path)])
         make = f"`{generate}` (for a small model, --size 64)"
-    if isinstance(resume, Path):
-        make = f"{make}, or set data.path=… to its new place"
-    Dataset("dataset", "card.yaml", make).convert(path, None, None)
+    try:
+        Dataset("dataset", "card.yaml", make).convert(path, None, None)
+    except DataError as error:
+        moved = " (if it lies elsewhere now, add data.path=PLACE)" * isinstance(resume, Path)
+        raise DataError(f"{error}{moved}") from None
 
     wait_without_spinning()
     from acwm_core.training.fit import fit as train  # last: importing torch takes seconds

@@ -26,9 +26,12 @@ def plain_table(title: str | None, first: str, numbers: Sequence[str]) -> Table:
 
 def print_table(
     console: Console,
-    title: str,
+    title: str | None,
     numbers: Sequence[str],
     rows: Sequence[tuple[str, Sequence[str]]],
+    *,
+    first: str = "",
+    close: bool = False,
 ) -> None:
     """Print a `plain_table`; columns that do not fit beside the others follow below them.
 
@@ -37,12 +40,17 @@ def print_table(
         title: its title.
         numbers: headings of the columns of numbers.
         rows: a name, and a cell for each column.
+        first: heading of the column of names.
+        close: whether columns stand as close to each other as they can, and names wrap.
     """
     from rich.measure import Measurement
 
     def table(columns: Sequence[int], title: str | None) -> Table:
-        grid = plain_table(title, "", [numbers[column] for column in columns])
+        grid = plain_table(title, first, [numbers[column] for column in columns])
         grid.columns[0].no_wrap, grid.columns[0].overflow = False, "fold"  # a name is never cut
+        if close:
+            grid.padding, grid.pad_edge = (0, 1, 0, 0), False
+            grid.columns[0].max_width = 14
         for name, cells in rows:
             grid.add_row(name, *(cells[column] for column in columns))
         return grid

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import shutil
 from collections.abc import Generator
 from pathlib import Path
@@ -69,9 +70,10 @@ def checkpoint_to_resume(
         )
     differences = _differences(run, recipe, card, last)
     if differences:
+        start = shlex.quote(f"training.init_from={run.path}")
         raise TrainingError(
             f"{run.path} was started with another recipe: {few(differences)}; "
-            f"`{resume_command(run)}` continues it as it was, training.init_from={run.path} starts "
+            f"`{resume_command(run)}` continues it as it was, {start} starts "
             "another run from its weights"
         )
     if last is not None:

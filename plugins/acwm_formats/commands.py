@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Union, cast, get_args, get_origi
 import click
 
 from acwm_core.cli.arguments import DATASET, OUT_FOLDER, numbers, size
-from acwm_core.cli.tables import plain_table
+from acwm_core.cli.tables import print_table
 from acwm_core.errors import DataError, unknown_name
 from acwm_formats.options import OPTIONS, import_options
 
@@ -141,11 +141,12 @@ def _print_facts(facts: dict[str, Any]) -> None:
             how = how if facts["shift"] else "exploratory"
             click.echo(f"{facts['exploration']:.0%} of the training episodes are {how}")
     columns = ("episodes", "made", "shards", "frames")
-    table = plain_table(None, "split", (*columns, "MB"))
-    for name, split in facts["splits"].items():
-        counts = [str(split[column]) for column in columns]
-        table.add_row(name, *counts, f"{split['bytes'] / 1e6:.1f}")
-    Console(highlight=False, markup=False).print(table)
+    rows = [
+        (name, [*(str(split[c]) for c in columns), f"{split['bytes'] / 1e6:.1f}"])
+        for name, split in facts["splits"].items()
+    ]
+    console = Console(highlight=False, markup=False)
+    print_table(console, None, (*columns, "MB"), rows, first="split")
     for name, split in facts["splits"].items():
         for label, count in split.get("ood_labels", {}).items():
             click.echo(f"{name}: {count} episode{'s' * (count != 1)}, shift {label}")

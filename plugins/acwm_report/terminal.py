@@ -295,18 +295,15 @@ def _print_uses(console: Console, comparison: Comparison, letters: Mapping[str, 
 def print_page_table(table: PageTable) -> None:
     """Print a table of a page: below each number is its 95 % interval, as there."""
     from rich.console import Console
-    from rich.table import Table
 
-    grid = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, title=table.title)
-    grid.title_justify, grid.title_style = "left", "bold"
-    grid.add_column(table.corner, overflow="fold")
-    for column in table.columns:
-        head = f"{column.title} {column.unit} {column.better}".strip()
-        grid.add_column("\n".join(head.split()), justify="right", overflow="fold")
-    for row in table.rows:
-        cells = (f"{cell.text}\n{cell.interval}".rstrip() for cell in row.cells)
-        grid.add_row(row.title, *cells)
-    Console(highlight=False, markup=False).print(grid, table.caption, sep="\n")
+    console = Console(highlight=False, markup=False)
+    heads = [" ".join(f"{c.title} {c.unit} {c.better}".split()) for c in table.columns]
+    rows = [
+        (row.title, [f"{cell.text}\n{cell.interval}".rstrip() for cell in row.cells])
+        for row in table.rows
+    ]
+    print_table(console, table.title, heads, rows, first=table.corner, close=True)
+    console.print(table.caption)
 
 
 def print_ranking(ranking: Ranking) -> None:

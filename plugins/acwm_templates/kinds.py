@@ -26,22 +26,24 @@ KINDS = {
         "acwm generate NAME --size 64 --episodes 100",
     ),
     "codec": Kind(
-        "codec", "every frame by itself: strides 8×8", "acwm fit push_cube_small codec=NAME"
+        "codec",
+        "every frame by itself: strides 8×8",
+        "acwm fit push_cube_small codec=NAME --out runs/NAME",
     ),
     "model": Kind(
         "model",
         "a convolutional denoiser that looks back in time",
-        "acwm fit push_cube_small model=NAME",
+        "acwm fit push_cube_small model=NAME --out runs/NAME",
     ),
     "conditioner": Kind(
         "conditioner",
         "a linear layer of the actions of each latent frame",
-        "acwm fit push_cube_small conditioner=NAME",
+        "acwm fit push_cube_small conditioner=NAME --out runs/NAME",
     ),
     "objective": Kind(
         "objective",
         "diffusion forcing whose past is never noisier than its future",
-        "acwm fit push_cube_small objective=NAME",
+        "acwm fit push_cube_small objective=NAME --out runs/NAME",
     ),
     "metric": Kind(
         "metric",

@@ -112,13 +112,18 @@ def test_no_distance_is_below_zero():
     assert row.distance.low == 0
 
 
-def test_the_printed_table_fits_a_terminal(capsys):
+@pytest.mark.parametrize("width", [80, 45])
+def test_the_printed_table_fits_a_terminal(capsys, monkeypatch, width):
+    """On a narrow one, columns follow below each other, and no number is broken."""
+    monkeypatch.setenv("COLUMNS", str(width))
     more = {"seconds_per_decision": 12.345, "rollouts_per_decision": 4096.0}
     lines = [line("model", seed, True, **more) for seed in range(50)]
     for row in ("simulator", "codec"):
         lines += [line(row, seed, seed % 7 == 0, **more) for seed in range(50)]
     print_page_table(plan_table(PlanTable("slide", "place", summarise(lines), "px")))
     printed = capsys.readouterr().out
-    assert max(map(len, printed.splitlines())) <= 80
-    for text in ("50/50", "8/50", "4096", "Clopper"):
+    assert max(map(len, printed.splitlines())) <= width
+    assert printed.count("Solved") == 1
+    assert printed.count("Controller") == (1 if width == 80 else 3)
+    for text in ("50/50", "8/50", "4096", "4.5e-13", "Clopper"):
         assert text in printed
