@@ -80,8 +80,12 @@ def check(path: Path, replays: int) -> int:
 
 @data.command("label")
 @click.argument("path", metavar="DATA", type=DATASET)
+@click.option("--from", "labelled", type=DATASET, help="Dataset with recorded actions.")
 @click.option(
-    "--from", "labelled", type=DATASET, required=True, help="Dataset with recorded actions."
+    "--latent",
+    type=click.IntRange(1, 8),
+    metavar="N",
+    help="Learn latent actions of N whole numbers from the videos alone.",
 )
 @click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
 @click.option(
@@ -94,13 +98,30 @@ def check(path: Path, replays: int) -> int:
     default=0.0,
     help="Mean confidence below which an episode is left out.",
 )
-def label_data(path: Path, labelled: Path, out: Path, **options: Any) -> None:
+def label_data(
+    path: Path, labelled: Path | None, latent: int | None, out: Path, least: float, **options: Any
+) -> None:
     """Read the actions of the episodes of DATA from their videos.
 
     An inverse dynamics model learns from the episodes of --from what action lies between frames.
     The new dataset has the recorded episodes and the labelled ones; its card tells which are which,
     and its state has the confidence of every action. Actions that DATA has are not used.
+
+    With --latent, where no actions were recorded at all, the new dataset has the episodes of DATA
+    with latent actions: whole numbers from -2 to 2 that tell what happens between two frames. Then
+    --from is optional, and what relates latent to recorded actions is fitted to its episodes.
     """
+    if latent is not None:
+        if least:
+            raise click.UsageError("--least needs labels with a confidence: leave out --latent")
+        _label_latent(path, out, latent, labelled, **options)
+    elif labelled is None:
+        raise click.UsageError("give --from LABELLED, or --latent N if no actions were recorded")
+    else:
+        _label(path, labelled, out, least=least, **options)
+
+
+def _label(path: Path, labelled: Path, out: Path, **options: Any) -> None:
     from acwm_formats.inverse.label import label
 
     done = label(path, labelled, out, **options)
@@ -108,8 +129,7 @@ def label_data(path: Path, labelled: Path, out: Path, **options: Any) -> None:
     click.echo(f"actions of {quality.episodes} held-out recorded episodes, read from their videos:")
     rows = zip(action.names, action.units, quality.explained, quality.error, strict=True)
     for name, unit, share, error in rows:
-        how = "never changes" if share != share else f"R² {share:.2f}, error {error:.3g} {unit}"
-        click.echo(f"  {name}: {how}")
+        click.echo(_explained(name, share, f", error {error:.3g} {unit}"))
     halves = f"{quality.surer:.2f} where it is surer, {quality.less_sure:.2f} elsewhere"
     click.echo(f"  mean R² {quality.mean:.2f}: {halves}")
     mean = sum(done.confidence) / len(done.confidence)
@@ -120,6 +140,40 @@ def label_data(path: Path, labelled: Path, out: Path, **options: Any) -> None:
     click.echo(f"{out} holds {done.card.splits['train']} training episodes")
     if quality.mean < 0.5:
         click.echo("less than half is explained: label more episodes, or raise --steps")
+
+
+def _label_latent(
+    path: Path, out: Path, dimensions: int, labelled: Path | None, **options: Any
+) -> None:
+    from acwm_formats.inverse.latent_label import label_latent
+
+    done = label_latent(path, out, dimensions, labelled, **options)
+    quality, tied = done.quality, done.tie
+    click.echo(
+        f"changes between frames of {quality.episodes} held-out episodes: {quality.explained:.0%} "
+        f"predicted with their latent actions, {quality.shuffled:.0%} with those of other moments"
+    )
+    click.echo(f"of {quality.possible} codes, {quality.codes:.1f} are in effective use")
+    if quality.collapsed:
+        click.echo(
+            "the latent actions have collapsed: nearly all moments have one code, so they say "
+            "nothing; raise --steps, or choose another --seed"
+        )
+    if tied is not None:
+        click.echo(
+            f"recorded actions of {tied.episodes} held-out episodes, from latent ones by a linear "
+            f"map that was fitted to {tied.recorded} others:"
+        )
+        action = zip(done.card.source["tied"]["actions"], tied.explained, strict=True)
+        for name, share in action:
+            click.echo(_explained(name, share))
+    click.echo(f"{out} holds {done.card.splits['train']} training episodes")
+    click.echo(f"next: acwm fit small {shlex.quote(f'data.path={out}')}")
+
+
+def _explained(name: str, share: float, error: str = "") -> str:
+    """A line with the R² of a dimension of the action."""
+    return f"  {name}: {'never changes' if share != share else f'R² {share:.2f}{error}'}"
 
 
 def _print_facts(facts: dict[str, Any]) -> None:

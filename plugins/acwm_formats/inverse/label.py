@@ -75,7 +75,7 @@ def label(
     if Path(out).exists():
         raise DataError(f"{out} already exists: choose another --out, or delete it")
     recorded, unlabelled = EpisodeDataset(labelled, "train"), EpisodeDataset(data, "train")
-    _check_alike(unlabelled, recorded)
+    check_alike(unlabelled, recorded)
     reader = ActionReader(recorded, steps=steps, seed=seed, progress=progress)
     labels: dict[int, ActionEstimates] = {}
     with progress_bar("labelling", len(unlabelled), shown=progress) as report:
@@ -96,7 +96,12 @@ def label(
     return Labelled(written, reader.quality, confidences, len(sure) - len(kept))
 
 
-def _check_alike(data: EpisodeDataset, labelled: EpisodeDataset) -> None:
+def check_alike(data: EpisodeDataset, labelled: EpisodeDataset) -> None:
+    """Refuse recorded actions of another camera, size or rate than the videos.
+
+    Raises:
+        DataError: says how to import one of them again.
+    """
     ours, theirs = data.card.environment, labelled.card.environment
     if ours.frame_size != theirs.frame_size or ours.views != theirs.views:
         sizes = ["×".join(map(str, environment.frame_size)) for environment in (ours, theirs)]

@@ -87,7 +87,7 @@ class ActionReader:
         if len(episodes) < 2:
             raise DataError(f"{episodes.path} has one labelled episode: two are needed, to test")
         training, held = hold_out(len(episodes), None)
-        chosen = list(_up_to(episodes, training))
+        chosen = list(up_to(episodes, training))
         actions = [episodes.actions(index)[:-1] for index in chosen]
         every = np.concatenate(actions)
         self._low, self._high = (
@@ -167,21 +167,22 @@ class ActionReader:
         confidence = self._confidence(variance)
         order = np.argsort(-confidence)
         halves = np.array_split(order, 2)
-        surer, less_sure = (self._explained(wanted[half], mean[half], wanted) for half in halves)
+        spread = np.where(self._varies, wanted.var(0), np.nan)
+        surer, less_sure = (explained(wanted[half], mean[half], spread) for half in halves)
         return Quality(
             len(held),
             len(wanted),
-            tuple(self._explained(wanted, mean, wanted).tolist()),
+            tuple(explained(wanted, mean, spread).tolist()),
             tuple((np.abs(wanted - mean).mean(0) * self._std).tolist()),
             float(np.nanmean(surer)),
             float(np.nanmean(less_sure)),
         )
 
-    def _explained(self, wanted: Floats, mean: Floats, every: Floats) -> Floats:
-        """R² of each dimension; the variance is that of `every`."""
-        spread = np.where(self._varies, every.var(0), np.nan)
-        shares = 1 - ((wanted - mean) ** 2).mean(0) / np.maximum(spread, 1e-12)
-        return shares.astype(np.float32)
+
+def explained(wanted: Floats, found: Floats, variance: Floats) -> Floats:
+    """R² of each dimension of actions `[N, A]`, whose `variance` is NaN if it never changes."""
+    shares = 1 - ((wanted - found) ** 2).mean(0) / np.maximum(variance, 1e-12)
+    return shares.astype(np.float32)
 
 
 def small(video: NDArray[np.uint8]) -> Tensor:
@@ -193,7 +194,7 @@ def small(video: NDArray[np.uint8]) -> Tensor:
     return torch.nn.functional.avg_pool2d(frames.float(), factor).round().byte()
 
 
-def _up_to(episodes: EpisodeDataset, indices: Sequence[int]) -> Iterator[int]:
+def up_to(episodes: EpisodeDataset, indices: Sequence[int]) -> Iterator[int]:
     """The first episodes, of up to `MOST_FRAMES` frames together."""
     frames = 0
     for index in indices:
