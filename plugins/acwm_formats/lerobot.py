@@ -301,6 +301,9 @@ def _numbers(table: Any, name: str) -> NDArray[Any]:
     if column.null_count:
         row = column.is_null().index(True).as_py()
         raise DataError(f"{name} is null in row {row} (counted from 0)")
+    if types.is_list(column.type) and column.flatten().null_count:
+        row = next(place for place, entries in enumerate(column.to_pylist()) if None in entries)
+        raise DataError(f"{name} has an entry that is null in row {row} (counted from 0)")
     try:
         if types.is_list(column.type) and not types.is_nested(column.type.value_type):
             (length,) = set(column.value_lengths().to_pylist())
@@ -363,7 +366,15 @@ def _empty(place: EpisodeFiles, names: Sequence[str]) -> list[str]:
         table = read_columns(place.data, list(names), place.episode)
     except DataError:
         return []  # opening the episode will tell why
-    return [name for name in names if len(table) and table.column(name).null_count == len(table)]
+    return [name for name in names if len(table) and _is_null(table.column(name))]
+
+
+def _is_null(column: Any) -> bool:
+    """Whether each row is null, or a list of nulls."""
+    entries = column.combine_chunks()
+    while arrow.types.is_list(entries.type) or arrow.types.is_fixed_size_list(entries.type):
+        entries = entries.flatten()
+    return entries.null_count == len(entries)
 
 
 def _unused(features: Mapping[str, Mapping[str, Any]], used: Sequence[str]) -> list[str]:

@@ -132,10 +132,14 @@ def test_an_episode_that_is_there_twice(root):
         LeRobot().read(root)
 
 
-def test_a_state_that_is_null_is_left_out(root, tmp_path):
+@pytest.mark.parametrize("kind", [None, pa.list_(pa.float32()), pa.list_(pa.float32(), 2)])
+def test_a_state_that_is_null_is_left_out(root, tmp_path, kind):
+    """Rows that are null, or vectors of nulls."""
+
     def empty(table):
-        place = table.column_names.index("observation.state")
-        return table.set_column(place, "observation.state", pa.nulls(len(table)))
+        place, count = table.column_names.index("observation.state"), len(table)
+        values = pa.nulls(count) if kind is None else pa.array([[None, None]] * count, kind)
+        return table.set_column(place, "observation.state", values)
 
     rows(root, empty)
     card = imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
@@ -180,6 +184,19 @@ def test_a_success_that_nobody_recorded_is_named(root, tmp_path):
     card = imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
     assert any("null: next.success" in note for note in card.source["notes"])
     assert "successes" not in EpisodeDataset(tmp_path / "data", "train").about(0)["facts"]
+
+
+@pytest.mark.parametrize("name", ["observation.state", "action"])
+def test_an_entry_that_is_null_is_named(root, tmp_path, name):
+    def hole(table):
+        place = table.column_names.index(name)
+        values = table.column(name).to_pylist()
+        values[3][1] = None
+        return table.set_column(place, name, pa.array(values, pa.list_(pa.float32())))
+
+    rows(root, hole)
+    with pytest.raises(DataError, match=rf"{name} has an entry that is null in row 3"):
+        imported(LeRobot().read(root), tmp_path / "data", test_episodes=0)
 
 
 @pytest.mark.parametrize("name", ["observation.state", "action"])
