@@ -20,6 +20,9 @@ Channels = Literal["rgb", "rgba", "newest-last", "newest-first"]
 
 PLACES = 16  # pairs of frames that are compared, at most
 
+APART = range(1, 5)
+"""Frames from one moment of a stack to the next."""
+
 STACKED = "Frames are stacks of {count} grey frames; the newest is shown (--channels {channels})."
 
 
@@ -33,31 +36,38 @@ def channels_of(images: Sequence[Any], image: Callable[[Any], NDArray[Any]]) -> 
     Raises:
         DataError: four channels could be opacity as well as four moments.
     """
-    last = first = opaque = True
-    varied, count = False, 0
-    pairs = np.linspace(0, max(0, len(images) - 2), min(max(len(images) - 1, 1), PLACES))
-    for place in dict.fromkeys(pairs.astype(int).tolist()):
-        one = channels_last(image(images[place]))
-        two = channels_last(image(images[min(place + 1, len(images) - 1)]))
-        count = two.shape[2]
-        opaque = opaque and all(_is_full(image[..., -1]) for image in (one, two))
-        if (two == two[..., :1]).all() and (one == one[..., :1]).all():
-            continue  # grey: it does not tell moments from colours
-        varied = True
-        last = last and np.array_equal(two[..., :-1], one[..., 1:])
-        first = first and np.array_equal(two[..., 1:], one[..., :-1])
-        if not (last or first) and (count == 3 or not opaque):
-            break
-    if len(images) > 1 and varied and (last or first):
-        return "newest-last" if last else "newest-first"
-    if count == 3:
+    for apart in APART:
+        if stacked := _stacked(images, image, apart):
+            return stacked
+    chosen = np.linspace(0, len(images) - 1, min(len(images), PLACES)).astype(int).tolist()
+    if channels_last(image(images[0])).shape[2] == 3:
         return "rgb"
-    if opaque:
+    if all(_is_full(channels_last(image(images[place]))[..., -1]) for place in chosen):
         return "rgba"
     raise DataError(
         "its frames have four channels, which may be colours and opacity or four grey frames: give "
         "--channels rgba, newest-last or newest-first"
     )
+
+
+def _stacked(
+    images: Sequence[Any], image: Callable[[Any], NDArray[Any]], apart: int
+) -> Channels | None:
+    """The order of moments that are so many frames apart, if each channel is one."""
+    last = first = True
+    varied, most = False, len(images) - apart
+    for place in dict.fromkeys(np.linspace(0, most - 1, min(max(most, 0), PLACES)).astype(int)):
+        one, two = (channels_last(image(images[n])) for n in (place, place + apart))
+        if (two == two[..., :1]).all() and (one == one[..., :1]).all():
+            continue  # grey: it does not tell moments from colours
+        varied = True
+        last = last and np.array_equal(two[..., :-1], one[..., 1:])
+        first = first and np.array_equal(two[..., 1:], one[..., :-1])
+        if not (last or first):
+            return None
+    if not varied:
+        return None
+    return "newest-last" if last else "newest-first"
 
 
 def _is_full(values: NDArray[Any]) -> bool:

@@ -23,9 +23,9 @@ RGBA = RNG.integers(0, 256, (COUNT, SIDE, SIDE, 4), dtype=np.uint8)
 ROWS = RNG.uniform(-1, 1, (COUNT, 2)).astype(np.float32)
 
 
-def stacked(depth=4, *, first=False, screens=SCREENS):
+def stacked(depth=4, *, first=False, screens=SCREENS, apart=1):
     """Stacks ``[T, depth, H, W]`` of the last screens; the first is repeated at the start."""
-    places = np.arange(len(screens))[:, None] - np.arange(depth)
+    places = np.arange(len(screens))[:, None] - apart * np.arange(depth)
     return screens[np.maximum(places if first else places[:, ::-1], 0)]
 
 
@@ -118,6 +118,15 @@ def test_a_stack_in_which_little_moves_is_one():
     screens[9:, 3, 3] = 200
     assert frames_of(stacked(screens=screens)).colour_order == "newest-last"
     assert frames_of(stacked(3, screens=screens)).colour_order == "newest-last"
+
+
+@pytest.mark.parametrize("apart", [2, 3, 4])
+@pytest.mark.parametrize("depth", [3, 4])
+@pytest.mark.parametrize("first", [False, True])
+def test_a_stack_whose_moments_are_some_frames_apart(apart, depth, first):
+    frames = frames_of(stacked(depth, first=first, apart=apart))
+    assert frames.colour_order == ("newest-first" if first else "newest-last")
+    np.testing.assert_array_equal(next(frames.read([9]))[..., 0], SCREENS[9])
 
 
 def test_colours_are_no_stack():
