@@ -38,6 +38,11 @@ class PolicyPrior:
                 f"the policy {name} holds an action for {self._policy.card.repeat} frames, but a "
                 f"latent frame of the model has {stride}: give planner.prior another one"
             )
+        if self._policy.observes == "frame":
+            raise RecipeError(
+                f"the policy {name} observes pictures, but a plan moves states: give planner.prior "
+                "another one"
+            )
         self._seen: Mapping[str, NDArray[np.float32]] | None = None
 
     def begin(self, task: Task, goal: Goal) -> None:

@@ -39,10 +39,10 @@ class PolicyDriver(Driver):
             raise RecipeError(
                 f"{folder} holds no policy yet: train one with `acwm policy train {name}`"
             )
-        estimator = estimator_for(card)
-        if estimator is None:
+        self._policy = policy_for(str(folder), card, task.name)
+        self._estimator = estimator_for(card)
+        if self._estimator is None and self._policy.observes == "state":
             raise DataError(f"no estimator reads the states of {card.name} from pictures")
-        self._policy, self._estimator = policy_for(str(folder), card, task.name), estimator
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:
         self._policy.reset(goal)
@@ -54,6 +54,9 @@ class PolicyDriver(Driver):
         check: Callable[[], None],
     ) -> Sequence[NDArray[np.float32]]:
         """See `Driver.act`: one decision, held as long as in training."""
-        states = self._estimator.read(as_clip(frames[-1][None])).states
-        action = self._policy.predict({name: values[0] for name, values in states.items()})
+        if self._policy.observes == "frame" or self._estimator is None:
+            action = self._policy.predict(frames[-1])
+        else:
+            states = self._estimator.read(as_clip(frames[-1][None])).states
+            action = self._policy.predict({name: values[0] for name, values in states.items()})
         return [action] * self._policy.card.repeat

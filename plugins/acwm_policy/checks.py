@@ -18,7 +18,8 @@ from acwm_core.checks.result import Suite, expect, expect_equal, expect_is_a
 from acwm_core.env.environment import Environment
 from acwm_core.env.physics import Observation
 from acwm_core.env.task import Goal, Task
-from acwm_planning.policies.saved import PolicyInputs, layers_of
+from acwm_planning.policies.networks import layers_of
+from acwm_planning.policies.saved import PolicyInputs
 from acwm_policy.episodes import Episodes
 from acwm_policy.learner import Learner
 from acwm_policy.lesson import Lesson, Measured, Place

@@ -54,7 +54,7 @@ ROWS = (TRAINED, DREAM, BESIDE, "solution", "behaviour", "random", "still")
 
 
 class StateController(Controller):
-    """Lets a saved policy act on the simulator's own states.
+    """Lets a saved policy act on the simulator's own states, or on its frames.
 
     Args:
         policy: the policy.
@@ -70,7 +70,9 @@ class StateController(Controller):
 
     def act(self, history: History) -> Actions:
         """The policy's action, held for a latent frame."""
-        action = self._policy.predict(self._environment.observe_state())
+        of_frames = self._policy.observes == "frame"
+        seen = history.frames[-1] if of_frames else self._environment.observe_state()
+        action = self._policy.predict(seen)
         return [action] * self._policy.card.repeat
 
 
@@ -292,7 +294,8 @@ def task_of(policy: SavedPolicy, card: EnvironmentCard) -> Task:
 def dreams(bundle: RunBundle, policy: SavedPolicy) -> bool:
     """Whether a model predicts what a policy observes, at the rate at which it decides."""
     shapes, rate = bundle.world_model.state_shapes, bundle.world_model.codec.temporal_stride
-    return {*policy.card.inputs.state} <= {*shapes} and policy.card.repeat == rate
+    predicted = policy.observes == "state" and {*policy.card.inputs.state} <= {*shapes}
+    return predicted and policy.card.repeat == rate
 
 
 def gap_of(lines: Sequence[Line]) -> PairedDifference:

@@ -28,6 +28,7 @@ class Learner(ABC):
         steps: number of steps so far.
         hold: of recordings, number of frames for which an action of the policy is held.
         chunk: of recordings, number of actions that it decides on at once.
+        picture: of recordings, longer side of the pictures that it observes, in pixels.
     """
 
     places: ClassVar[tuple[Place, ...]] = ("dream", "simulator")
@@ -35,6 +36,7 @@ class Learner(ABC):
     steps: int = 0
     hold: int = 4
     chunk: int = 1
+    picture: int = 48
 
     @classmethod
     def parameters(cls) -> Mapping[str, Parameter]:
@@ -67,7 +69,7 @@ class Learner(ABC):
     def network(self) -> nn.Sequential:
         """The policy so far: maps observations `[N, O]` to actions `[N, A]` in [-1, 1].
 
-        It consists of linear layers and of `acwm_planning.policies.saved.ACTIVATIONS`.
+        It consists of layers of `acwm_planning.policies.networks`.
         """
 
     @abstractmethod

@@ -28,7 +28,7 @@ from acwm_planning.policies.saved import PolicyInputs, side_by_side
 from acwm_planning.rewards.task import RewardTask
 from acwm_policy.episodes import Episodes
 from acwm_policy.judging import judge, needs_of
-from acwm_policy.recordings import Recordings, read_recordings
+from acwm_policy.recordings import PICTURES, Recordings, read_recordings
 from acwm_policy.scenes import DreamScenes, Scenes, SimulatorScenes, States
 
 Place = Literal["dream", "simulator", "recordings"]
@@ -228,6 +228,7 @@ def imitate(
     observe: Sequence[str] | None,
     hold: int,
     chunk: int,
+    picture: int = 48,
 ) -> Lesson:
     """Recordings to imitate.
 
@@ -237,16 +238,17 @@ def imitate(
         observe: names of the fields of the state to observe; see `PolicySettings`.
         hold: number of frames for which an action is held.
         chunk: number of actions that are decided on at once.
+        picture: longer side of pictures that are observed, in pixels.
 
     Raises:
         RecipeError: the dataset is of another environment.
-        DataError: it has no states, or too few episodes.
+        DataError: it has too few episodes.
     """
     train = EpisodeDataset(Path(folder), "train")
     card = train.card.environment
     task = None if name == card.name else find_task(name, card)
     tested = EpisodeDataset(Path(folder), "ind_test") if train.card.splits.get("ind_test") else None
-    recordings, inputs = read_recordings(train, tested, task, observe, hold, chunk)
+    recordings, inputs = read_recordings(train, tested, task, observe, hold, chunk, picture)
     named = "" if task is None else task.name
     return Lesson(card, named, hold, "recordings", Measured(inputs, 1.0), recordings)
 
@@ -260,6 +262,8 @@ def chosen_fields(
     those that the task looks at; all that the model predicts if there is no estimator.
     """
     predicted = [*world.state_shapes]
+    if observe == PICTURES and "pictures" not in predicted:
+        raise RecipeError("observe=pictures is for algorithm=clone: a dream of states has none")
     for name in observe or ():
         if name not in predicted:
             known = ", ".join(predicted)

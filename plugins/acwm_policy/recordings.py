@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,18 +15,24 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal, Task
 from acwm_core.errors import DataError, RecipeError, suggest
 from acwm_core.evaluation.score import estimator_for
-from acwm_planning.policies.saved import PolicyInputs
+from acwm_planning.policies.saved import PolicyInputs, small_pictures
 from acwm_policy.judging import needs_of
+
+PICTURES = ["pictures"]
+"""What `PolicySettings.observe` is for pictures in place of states."""
 
 HELD_OUT = 10
 """One of so many training episodes is kept for measuring errors, if there is no split for it."""
+
+MOST_PICTURES = 2000
+"""About as many moments with pictures are looked at to measure an error."""
 
 
 class Recorded(NamedTuple):
     """An episode of T frames.
 
     Attributes:
-        states: what is observed of the state, `[T, S]`.
+        states: what is observed of the state, `[T, S]`, or of the pictures; see `PolicyInputs`.
         goals: what would be the goal if the episode were to lead to a frame, `[T, G]`.
         actions: scaled to [-1, 1], `[T, A]`; row t leads from frame t to t + 1.
     """
@@ -79,7 +86,8 @@ class Recordings:
         self._learnt = learnt
         self.observed, self.action_size = inputs.size, chunk * learnt.actions.shape[1]
         tested = tested if len(tested) else learnt
-        every = torch.arange(0, len(tested), hold)
+        apart = max(hold, len(tested) // MOST_PICTURES) if inputs.picture else hold
+        every = torch.arange(0, len(tested), apart)
         self._tested = self._decisions(tested, every, torch.Generator().manual_seed(0))
         away = self._tested.actions - learnt.actions.mean(0).float().repeat(chunk)
         self._spread = float(away.square().mean())
@@ -133,8 +141,10 @@ class _Frames:
         lengths = torch.tensor([len(episode.states) for episode in long], dtype=torch.int64)
         self._ends, self._counted = lengths.cumsum(0), (lengths - span).cumsum(0)
         self._begun, self._span = self._ends - lengths, span
-        empty = Recorded(*[torch.zeros(0, 0)] * 3)
-        self.states, self.goals, self.actions = map(torch.cat, zip(*(long or [empty]), strict=True))
+        states, goals, actions = zip(*(long or [Recorded(*[torch.zeros(0, 0)] * 3)]), strict=True)
+        same = all(one is other for one, other in zip(states, goals, strict=True))
+        self.states, self.actions = torch.cat(states), torch.cat(actions)
+        self.goals = self.states if same else torch.cat(goals)  # pictures are large
 
     def __len__(self) -> int:
         return int(self._counted[-1]) if len(self._counted) else 0
@@ -152,6 +162,7 @@ def read_recordings(
     observe: Sequence[str] | None,
     hold: int,
     chunk: int,
+    picture: int = 48,
 ) -> tuple[Recordings, PolicyInputs]:
     """The recordings of a dataset, and what a policy observes of them.
 
@@ -159,9 +170,11 @@ def read_recordings(
         folder: the episodes to learn from.
         held_out: those to measure errors on; every tenth of the others if None.
         task: says what a goal is; None for a policy without goals.
-        observe: fields of the state to observe; see `PolicySettings`.
+        observe: fields of the state to observe, or `PICTURES`, which are all that is observed of
+            data without states; see `PolicySettings`.
         hold: see `Recordings`.
         chunk: see `Recordings`.
+        picture: longer side of the pictures, in pixels; smaller frames stay as they are.
 
     Raises:
         DataError: there are too few episodes, or a field is missing.
@@ -169,21 +182,26 @@ def read_recordings(
     """
     card = folder.card.environment
     shapes = {field.name: [*field.shape] for field in card.state}
-    if not shapes:
-        raise DataError(
-            f"{folder.path} has no states, which a policy observes: import it with columns of "
-            "states"
-        )
-    aims, needed = _goal_of(folder, task, shapes)
-    state = {name: shapes[name] for name in _observed(card, shapes, needed, observe)}
+    seen, aims, needed = None, dict[str, list[int]](), list[str]()
+    if (observe == PICTURES and "pictures" not in shapes) or not (shapes or observe):
+        share = min(1.0, picture / max(card.frame_size))
+        size = [max(1, round(side * share)) for side in card.frame_size]
+        seen = PolicyInputs({}, {}, [], [], [], size, task is not None)
+    else:
+        aims, needed = _goal_of(folder, task, shapes)
+    state = {n: shapes[n] for n in ([] if seen else _observed(card, shapes, needed, observe))}
     chosen = [range(len(folder)), range(0)]
     if held_out is None:
         cut = [number for number in range(len(folder)) if number % HELD_OUT == HELD_OUT - 1]
         chosen = [[n for n in range(len(folder)) if n not in {*cut}], cut]
-    sets = [[_recorded(folder, n, card, state, aims) for n in numbers] for numbers in chosen]
+    sets = [[_recorded(folder, n, seen, state, aims) for n in numbers] for numbers in chosen]
     if held_out is not None:
-        sets[1] = [_recorded(held_out, n, card, state, aims) for n in range(len(held_out))]
-    inputs = _scaled(sets[0], state, aims, hold)
+        sets[1] = [_recorded(held_out, n, seen, state, aims) for n in range(len(held_out))]
+    inputs = (
+        _scaled(sets[0], state, aims, hold)
+        if seen is None
+        else _scaled_pictures(sets[0], seen, hold)
+    )
     return Recordings(sets[0], sets[1], inputs, hold, chunk), inputs
 
 
@@ -221,19 +239,34 @@ def _observed(
 def _recorded(
     folder: EpisodeDataset,
     number: int,
-    card: EnvironmentCard,
+    seen: PolicyInputs | None,
     state: Mapping[str, list[int]],
     aims: Mapping[str, list[int]],
 ) -> Recorded:
-    low, high = (
-        torch.tensor(bound, dtype=torch.float64) for bound in (card.action.low, card.action.high)
-    )
+    """An episode: its pictures if these are `seen`, else some fields of the state and the goal."""
+    action = folder.card.environment.action
+    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (action.low, action.high))
     actions = torch.from_numpy(np.array(folder.actions(number))).double()
     scaled = (2 * (actions - low) / (high - low) - 1).clamp(-1, 1)
+    if seen:
+        rows = small_pictures(torch.from_numpy(folder.video(number)), seen.picture)
+        return Recorded(rows, rows if seen.aims else rows[:, :0], scaled)
     parts = [folder.states(number, [*names]) for names in (state, aims) if names]
     values = [torch.from_numpy(part).double() for part in parts]
     goals = values[1] if aims else values[0][:, :0]
     return Recorded(values[0], goals, scaled)
+
+
+def _scaled_pictures(episodes: Sequence[Recorded], seen: PolicyInputs, hold: int) -> PolicyInputs:
+    """Pictures with their mean and spread in the recordings, of a few thousand frames."""
+    apart = max(1, sum(len(episode.states) for episode in episodes) // MOST_PICTURES)
+    whole = torch.cat([episode.states[::apart].float() for episode in episodes])
+    moved = [(e.states[hold::apart].float() - e.states[:-hold:apart]).flatten() for e in episodes]
+    mean = whole.mean(0)
+    spreads = [(whole - mean).square().mean().sqrt(), torch.cat(moved).square().mean().sqrt()]
+    std, change = ([max(float(spread), 1e-3)] for spread in spreads)
+    rounded = [round(value, 1) for value in mean.tolist()]
+    return replace(seen, mean=rounded, std=std, change=change)
 
 
 def _scaled(

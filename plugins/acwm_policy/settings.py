@@ -20,7 +20,7 @@ class PolicySettings:
     Attributes:
         algorithm: name of the learner.
         observe: names of the fields of the state to observe; by default those that are predicted
-            and that an estimator reads.
+            and that an estimator reads. Of recordings, ``["pictures"]`` observes their frames.
         bonus: reward for success; the way from a usual start to the goal is worth 1.
         parameters: of the learner, those that were set.
     """
@@ -78,7 +78,7 @@ def settings_of(overrides: Sequence[str]) -> PolicySettings:
             given[name] = {**given.get(name, {}), **value} if isinstance(value, dict) else value
     own: dict[str, Any] = {
         "algorithm": checked("algorithm", given.pop("algorithm", "sac"), str),
-        "observe": checked("observe", given.pop("observe", None), list[str] | None),
+        "observe": checked("observe", _listed(given.pop("observe", None)), list[str] | None),
         "bonus": checked("bonus", given.pop("bonus", 1.0), float),
     }
     known = learner_class(own["algorithm"]).parameters()
@@ -89,6 +89,11 @@ def settings_of(overrides: Sequence[str]) -> PolicySettings:
     settings = PolicySettings(**own, parameters=parameters)
     settings.learner()  # checks what types cannot express
     return settings
+
+
+def _listed(value: Any) -> Any:
+    """A name as the list of it."""
+    return [value] if isinstance(value, str) else value
 
 
 def _unknown(name: str, own: Mapping[str, Any], known: Mapping[str, Any]) -> RecipeError:

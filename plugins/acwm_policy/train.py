@@ -24,13 +24,8 @@ from acwm_core.files import held, load_plain, read_json, writing, written_whole
 from acwm_core.training.run import load_run
 from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_core.training.threads import use_threads
-from acwm_planning.policies.saved import (
-    POLICY_FILE,
-    PolicyCard,
-    PolicyInputs,
-    SavedPolicy,
-    layers_of,
-)
+from acwm_planning.policies.networks import layers_of
+from acwm_planning.policies.saved import POLICY_FILE, PolicyCard, PolicyInputs, SavedPolicy
 from acwm_planning.rewards.task import RewardTask
 from acwm_policy.learner import Learner
 from acwm_policy.lesson import (
@@ -186,7 +181,8 @@ def _imitate(
     }
     with _opened(out, about):
         use_threads(None, None, choose=True)
-        lesson = imitate(data, name, settings.observe, learner.hold, learner.chunk)
+        how = learner.hold, learner.chunk, learner.picture
+        lesson = imitate(data, name, settings.observe, *how)
         stored = load_checkpoint(out / CHECKPOINT)
         return _learn(lesson, settings, about, out, steps, stored, progress)
 

@@ -1,5 +1,7 @@
 """`algorithm=clone`: what is learnt from recordings, with a task and without one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,12 +10,17 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.generate import generate
 from acwm_core.env.task import Goal
 from acwm_core.errors import DataError, RecipeError
+from acwm_core.training.run import load_run
+from acwm_formats.recordings import ImportOptions, import_dataset
+from acwm_formats.timeline import RecordedDataset, Recording
+from acwm_planning.futures import ModelRollouts
 from acwm_planning.policies.own import OwnPolicy
-from acwm_planning.policies.saved import PolicyInputs, SavedPolicy
+from acwm_planning.policies.saved import PolicyInputs, SavedPolicy, small_pictures
+from acwm_planning.prior import PolicyPrior
 from acwm_policy.evaluate import evaluate_policy
 from acwm_policy.lesson import imitate
 from acwm_policy.recordings import Recorded, Recordings
-from acwm_policy.settings import settings_of
+from acwm_policy.settings import PolicySettings, settings_of
 from acwm_policy.train import train_policy
 from tests import tiny
 
@@ -132,3 +139,95 @@ def test_of_few_recordings_every_tenth_is_held_out(data):
     lengths = EpisodeDataset(data, "train").lengths
     assert len(lesson.recordings._learnt) == sum(lengths) - lengths[9] - 11 * 4
     assert len(lesson.recordings._tested.vectors) == -(-(lengths[9] - 4) // 4)
+
+
+def picture_rows(frames):
+    """Frames `[N, H, W, 3]` as rows of the same size."""
+    whole = torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2)
+    return small_pictures(whole, whole.shape[2:])
+
+
+def test_what_is_observed_of_pictures_is_now_the_change_and_the_goal():
+    inputs = PolicyInputs({}, {}, [51.0] * 12, [102.0], [51.0], [2, 2], True)
+    now, before, goals = (torch.full((1, 12), value, dtype=torch.uint8) for value in (255, 0, 153))
+    seen = inputs.vectors(now, before, goals).unflatten(1, (inputs.channels, 2, 2))
+    assert seen.shape[1] == 9
+    np.testing.assert_allclose(seen[0, :, 0, 0], [2] * 3 + [5] * 3 + [1] * 3, rtol=1e-6)
+    alone = replace(inputs, aims=False)
+    assert alone.vectors(now, before, goals[:, :0]).shape == (1, alone.size) == (1, 24)
+
+
+def test_pictures_shrink_by_areas():
+    frame = np.zeros((1, 4, 6, 3), np.uint8)
+    frame[0, :2, :2, 0] = 200
+    frame[0, 0, 0, 0] = 100
+    whole = torch.from_numpy(frame).permute(0, 3, 1, 2)
+    found = small_pictures(whole, [2, 3]).reshape(3, 2, 3)
+    assert found[0].tolist() == [[175, 0, 0], [0, 0, 0]]
+
+
+@pytest.mark.ci
+def test_a_clone_of_pictures_does_what_they_show(parts, tmp_path):
+    """Actions of these recordings are constant, so the change of the picture tells them."""
+    data = tmp_path / "data"
+    generate("slide", data, episodes={"train": 60}, workers=0, progress=False)
+    words = ["observe=pictures", "batch_size=64", "channels=[8,8]", "learning_rate=3e-3"]
+    policy = cloned(data, tmp_path / "clone", *words, name="slide")
+    assert policy.card.inputs.picture == [32, 32]
+    assert policy.card.training["error"] < 0.6
+    own = OwnPolicy(str(tmp_path / "clone"), tiny.Slide.card)
+    assert own.observes == "frame"
+    for number in range(3):
+        episode = EpisodeDataset(data, "train")[number]
+        own.reset(Goal({}, np.zeros(0), np.zeros(0)))
+        own.act(episode.video[4], None)
+        found = own.act(episode.video[8], None)
+        now, before = (picture_rows(episode.video[[k]]) for k in (8, 4))
+        with torch.no_grad():
+            scaled = policy.scaled(policy.card.inputs.vectors(now, before, now[:, :0]))[0, 0]
+        np.testing.assert_allclose(found, 2 * scaled.numpy(), atol=1e-5)
+
+
+def test_a_clone_of_pictures_acts_in_the_simulator_at_a_task(run, data, tmp_path):
+    policy = cloned(data, tmp_path / "clone", "observe=pictures", "channels=[4]", steps=512)
+    assert policy.card.inputs.aims
+    found = evaluate_policy(tmp_path / "clone", seeds=range(2), run=run, device="cpu")
+    assert {row["row"] for row in found["rows"]} >= {"trained", "random"}
+    assert found["gap"] is None
+    rollouts = ModelRollouts(load_run(run).world_model, tiny.Slide.card, None)
+    with pytest.raises(RecipeError, match="observes pictures, but a plan moves states"):
+        PolicyPrior(str(tmp_path / "clone"), rollouts)
+
+
+def test_recordings_without_states_are_cloned_from_their_pictures(data, tmp_path):
+    recordings = [
+        Recording(episode.video, episode.actions, {}) for episode in EpisodeDataset(data, "train")
+    ]
+    facts = {"kind": "arrays", "name": "slides"}
+    bare = RecordedDataset("slide", recordings, facts, fps=10)
+    options = ImportOptions(test_episodes=0)
+    import_dataset(bare, tmp_path / "bare", options, workers=0, progress=False)
+    policy = cloned(tmp_path / "bare", tmp_path / "clone", "picture=16", name="slide", steps=256)
+    assert policy.card.inputs.picture == [16, 16]
+    assert SavedPolicy.read(tmp_path / "clone").card.layers[0] == "picture 6 16 16"
+
+
+def test_a_file_with_layers_that_fit_nothing_is_refused(data, tmp_path):
+    cloned(data, tmp_path / "clone", "observe=pictures", "channels=[4]", steps=256)
+    saved = SavedPolicy.read(tmp_path / "clone")
+    for change in (
+        {"layers": ["picture 9 32 31", *saved.card.layers[1:]]},
+        {"layers": [saved.card.layers[0], "convolution 0", *saved.card.layers[2:]]},
+        {"inputs": replace(saved.card.inputs, picture=[4000, 4000])},
+        {"inputs": replace(saved.card.inputs, std=[])},
+        {"chunk": 2},
+    ):
+        SavedPolicy(replace(saved.card, **change), saved._network).save(tmp_path)
+        with pytest.raises(DataError, match="is no policy of this version"):
+            SavedPolicy.read(tmp_path)
+
+
+def test_a_dream_shows_no_pictures(run, tmp_path):
+    settings = PolicySettings("backprop", ["pictures"])
+    with pytest.raises(RecipeError, match="observe=pictures is for algorithm=clone"):
+        train_policy(run, "slide.place", settings=settings, out=tmp_path / "out", steps=8, starts=2)

@@ -16,7 +16,8 @@ from torch import nn
 from acwm_core.cli import main
 from acwm_core.errors import DataError, MissingExtraError, RecipeError
 from acwm_core.training.run import load_run
-from acwm_planning.policies.saved import SavedPolicy, layers_of, network_of, raw_actions
+from acwm_planning.policies.networks import layers_of, network_of
+from acwm_planning.policies.saved import SavedPolicy, raw_actions
 from acwm_policy.lesson import begin_episodes, prepare
 from acwm_policy.settings import PolicySettings, settings_of
 from tests import tiny

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 import safetensors
@@ -20,6 +20,7 @@ from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.task import Goal
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.files import check_fetched, parse_json, typed, written_whole
+from acwm_planning.policies.networks import network_of
 
 POLICY_FILE = "policy.safetensors"
 """The file in a policy's folder."""
@@ -27,12 +28,8 @@ POLICY_FILE = "policy.safetensors"
 FURTHEST = 10.0
 """Scaled observations are limited to ± this number, so that no outlier upsets a network."""
 
-ACTIVATIONS: Mapping[str, type[nn.Module]] = {
-    "relu": nn.ReLU,
-    "tanh": nn.Tanh,
-    "hardtanh": nn.Hardtanh,
-}
-"""What may stand between linear layers, by its name in the file."""
+MOST_SIDE = 1024
+"""Longest side of a picture that a policy may observe, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +37,18 @@ class PolicyInputs:
     """What a policy observes, as one vector.
 
     The state now, its change since the decision before, and the goal: fields side by side, scaled.
-    What is unknown is taken as the mean.
+    What is unknown is taken as the mean. Or the same of pictures: the frame now, its change, and
+    the goal's picture.
 
     Attributes:
         state: shapes of the fields of the state, by name.
         goal: shapes of the fields of the goal's state.
         mean: of the fields of the state and of the goal, `[S + G]`.
         std: their standard deviations.
-        change: standard deviation of the changes of the state, `[S]`.
+        change: standard deviation of the changes of the state, `[S]`. Of pictures, `mean` is the
+            mean one, `[3 · h · w]` from 0 to 255, and `std` and `change` hold one number each.
+        picture: height and width of the pictures; empty if states are observed.
+        aims: whether a picture of the goal is observed.
     """
 
     state: dict[str, list[int]]
@@ -55,14 +56,30 @@ class PolicyInputs:
     mean: list[float]
     std: list[float]
     change: list[float]
+    picture: list[int] = field(default_factory=list[int])
+    aims: bool = False
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the pictures."""
+        return 3 * (2 + self.aims)
 
     @property
     def size(self) -> int:
         """Number of values of the vector."""
+        if self.picture:
+            return self.channels * math.prod(self.picture)
         return len(self.mean) + len(self.change)
 
     def vectors(self, now: Tensor, before: Tensor, goals: Tensor) -> Tensor:
-        """The vectors `[N, size]` of states `[N, S]`, earlier ones, and goals `[N, G]`."""
+        """The vectors `[N, size]` of states `[N, S]`, earlier ones, and goals `[N, G]`.
+
+        Pictures are rows of `small_pictures`.
+        """
+        if self.picture:
+            mean, (std,), (change,) = torch.tensor(self.mean), self.std, self.change
+            shown = [(now - mean) / std, (now.float() - before) / change]
+            return torch.cat([*shown, *([(goals - mean) / std] if self.aims else [])], 1)
         mean, std, change = (
             torch.tensor(row, dtype=torch.float64) for row in (self.mean, self.std, self.change)
         )
@@ -70,6 +87,12 @@ class PolicyInputs:
         whole = torch.cat([(values - mean) / std, (now - before) / change], 1)
         whole = whole.nan_to_num(nan=0.0, posinf=FURTHEST, neginf=-FURTHEST)
         return whole.clamp(-FURTHEST, FURTHEST).float()
+
+
+def small_pictures(frames: Tensor, size: Sequence[int]) -> Tensor:
+    """Frames `[N, 3, H, W]` uint8 in another size, by areas, as rows `[N, 3 · h · w]` uint8."""
+    small = nn.functional.interpolate(frames.float(), size=(size[0], size[1]), mode="area")
+    return small.round().byte().flatten(1)
 
 
 def side_by_side(fields: Mapping[str, Any], shapes: Mapping[str, Sequence[int]]) -> Tensor:
@@ -92,7 +115,7 @@ class PolicyCard:
         low: lower bounds of the actions, `[A]`.
         high: upper bounds, `[A]`.
         inputs: what it observes.
-        layers: the network: numbers of linear layers among names of `ACTIVATIONS`.
+        layers: the network: widths of linear layers among names of others; see `networks`.
         training: how it was trained, for people.
         chunk: number of actions that it decides on at once.
     """
@@ -116,13 +139,16 @@ class SavedPolicy:
         network: maps vectors `[N, O]` to actions `[N, A]`, scaled to [-1, 1].
     """
 
-    observes = "state"
-
     def __init__(self, card: PolicyCard, network: nn.Module) -> None:
         self.card, self._network = card, network.eval()
         self._before: Tensor | None = None
         self._decided = list[Tensor]()
         self._goal: Tensor | None = None
+
+    @property
+    def observes(self) -> Literal["frame", "state"]:
+        """What `predict` takes."""
+        return "frame" if self.card.inputs.picture else "state"
 
     @torch.no_grad()
     def scaled(self, vectors: Tensor) -> Tensor:
@@ -132,32 +158,51 @@ class SavedPolicy:
     def reset(self, goal: Goal) -> None:
         """Start an episode."""
         shapes = self.card.inputs.goal
-        fields = {name: np.asarray(goal.state[name])[None] for name in shapes}
-        nothing = torch.zeros(1, 0, dtype=torch.float64)
-        self._goal = side_by_side(fields, shapes) if shapes else nothing
+        self._goal = torch.zeros(1, 0, dtype=torch.float64)
+        if self.card.inputs.aims:
+            self._goal = self._picture(goal.frame)
+        elif shapes:
+            fields = {name: np.asarray(goal.state[name])[None] for name in shapes}
+            self._goal = side_by_side(fields, shapes)
         self._before, self._decided = None, []
 
-    def predict(self, state: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+    def predict(self, seen: Mapping[str, NDArray[Any]] | NDArray[np.uint8]) -> NDArray[np.float32]:
         """The next raw action `[A]`; what is unknown is taken to be as it was.
+
+        Args:
+            seen: fields of the state, or a frame `[H, W, 3]`, as `observes` says.
 
         Raises:
             RecipeError: a field that the policy observes is missing, or no goal was given.
         """
-        shapes = self.card.inputs.state
-        if missing := [name for name in shapes if name not in state]:
-            raise RecipeError(
-                f"the policy observes {', '.join(missing)}, which nothing here reads: train one "
-                f"with observe=[{', '.join(name for name in shapes if name in state)}]"
-            )
         if self._goal is None:
             raise RecipeError("a policy needs its goal: call reset(goal) first")
-        now = side_by_side({name: np.asarray(state[name])[None] for name in shapes}, shapes)
+        now = self._state(seen) if isinstance(seen, Mapping) else self._picture(seen)
         before = now if self._before is None else self._before
         self._before = now = torch.where(now.isfinite(), now, before)
         if not self._decided:
             vectors = self.card.inputs.vectors(now, before, self._goal)
             self._decided = [*self.scaled(vectors)[0]]
         return raw_actions(self._decided.pop(0), self.card.low, self.card.high).numpy()
+
+    def _state(self, state: Mapping[str, NDArray[Any]]) -> Tensor:
+        """The fields of the state that are observed, `[1, S]`."""
+        shapes = self.card.inputs.state
+        if self.card.inputs.picture:
+            raise RecipeError("the policy observes pictures, and here are only states")
+        if missing := [name for name in shapes if name not in state]:
+            raise RecipeError(
+                f"the policy observes {', '.join(missing)}, which nothing here reads: train one "
+                f"with observe=[{', '.join(name for name in shapes if name in state)}]"
+            )
+        return side_by_side({name: np.asarray(state[name])[None] for name in shapes}, shapes)
+
+    def _picture(self, frame: NDArray[np.uint8]) -> Tensor:
+        """A frame `[H, W, 3]` as it is observed, a row of `small_pictures`."""
+        if not self.card.inputs.picture or np.ndim(frame) != 3 or frame.shape[2] != 3:
+            raise RecipeError("a policy observes states by name, or frames [H, W, 3], as trained")
+        whole = torch.from_numpy(np.array(frame)).permute(2, 0, 1)[None]
+        return small_pictures(whole, self.card.inputs.picture)
 
     def save(self, folder: Path) -> None:
         """Write the policy's file into a folder."""
@@ -233,50 +278,21 @@ def read_network(
     return card, network
 
 
-def network_of(layers: Sequence[int | str], weights: Mapping[str, Tensor]) -> nn.Sequential:
-    """The network of these layers; `ValueError` for one that does not exist."""
-    modules: list[nn.Module] = []
-    for place, layer in enumerate(layers):
-        if isinstance(layer, str):
-            if layer not in ACTIVATIONS:
-                raise ValueError(f"there is no layer {layer!r}")
-            modules.append(ACTIVATIONS[layer]())
-        else:
-            matrix = weights[f"{place}.weight"]
-            modules.append(nn.Linear(matrix.shape[1], matrix.shape[0]))
-    network = nn.Sequential(*modules)
-    network.load_state_dict(dict(weights))
-    return network
-
-
-def layers_of(network: nn.Sequential) -> list[int | str]:
-    """The layers of a network as a policy's file names them.
-
-    Raises:
-        RecipeError: it has layers that such a file cannot hold.
-    """
-    names, layers = {kind: name for name, kind in ACTIVATIONS.items()}, list[int | str]()
-    for module in network:
-        if isinstance(module, nn.Linear):
-            layers.append(module.out_features)
-        elif type(module) in names:
-            layers.append(names[type(module)])
-        else:
-            raise RecipeError(f"a policy with a layer {type(module).__name__} cannot be saved")
-    return layers
-
-
 def _check_sizes(card: PolicyCard, network: nn.Sequential) -> None:
     """Refuse a network that does not fit what it observes or moves, by `ValueError`."""
     inputs = card.inputs
     state, goal = (sum(map(math.prod, shapes.values())) for shapes in (inputs.state, inputs.goal))
     sizes = len(inputs.mean), len(inputs.std), len(inputs.change)
-    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
-    ends = (linear[0].in_features, linear[-1].out_features) if linear else (0, 0)
-    if sizes != (state + goal, state + goal, state) or ends != (
-        inputs.size,
-        card.chunk * len(card.low),
+    if inputs.picture and (
+        len(inputs.picture) != 2 or not 1 <= min(inputs.picture) <= max(inputs.picture) <= MOST_SIDE
     ):
+        raise ValueError("its pictures have no size")
+    wanted = (state + goal, state + goal, state)
+    if sizes != ((3 * math.prod(inputs.picture), 1, 1) if inputs.picture else wanted):
+        raise ValueError("its sizes do not fit each other")
+    with torch.no_grad():
+        actions = network(torch.zeros(1, inputs.size))
+    if actions.shape != (1, card.chunk * len(card.low)):
         raise ValueError("its sizes do not fit each other")
     if len(card.low) != len(card.high) or min(card.repeat, card.chunk) < 1:
         raise ValueError("its actions have no bounds")

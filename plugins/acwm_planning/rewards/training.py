@@ -21,7 +21,7 @@ from acwm_core.executors import progress_bar
 from acwm_core.files import writing
 from acwm_core.model.world_model import WorldModel
 from acwm_core.training.run import load_run
-from acwm_planning.policies.saved import layers_of
+from acwm_planning.policies.networks import layers_of
 from acwm_planning.rewards.columns import Column, find_column, is_outcome
 from acwm_planning.rewards.head import HeldOut, RewardCard, RewardHead, codes_of, scaled
 
