@@ -16,7 +16,9 @@ from acwm_core.recipe import Recipe, compose
 from acwm_core.recipe.former import current_settings
 from acwm_core.training.run_folder import RunFolder, copy_of, run_to_write
 from acwm_report.reproduce import commands
-from acwm_zoo.shipped import folder, shipped
+from acwm_zoo.shipped import MODEL_CARD, MODELS, folder, shipped
+from tests.repository.test_docs import commands as commands_of
+from tests.repository.test_docs import parse
 
 QUICK_FIT = [
     *("+quick", "trainer.max_steps=2", "training.sample_every_n_steps=0"),
@@ -130,6 +132,23 @@ def test_its_commands_ask_for_the_same_data_recipe_and_settings(name, tmp_path, 
     assert (tests.environment.name, tests.seed) == (facts["environment"], facts["seed"])
     for split in ("ind_test", "ood_test"):
         assert tests.splits[split] == facts["episodes"][split]
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_the_commands_of_its_card_are_read_and_make_its_data(name, tmp_path, monkeypatch, asked):
+    monkeypatch.chdir(tmp_path)
+    lines = commands_of(MODELS / name / MODEL_CARD)
+    assert {f"acwm rollout {name}", f"acwm evaluate {name}"} <= {line.strip() for line in lines}
+    for line in lines:
+        parse(main, shlex.split(line)[1:], line)
+    (generated,) = (shlex.split(line) for line in lines if line.startswith("acwm generate"))
+    run(*generated[1:])
+    recipe, card = (RunFolder(folder(name)).recipe, RunFolder(folder(name)).card)
+    made, card = asked[Path(compose(recipe, []).data["path"])], DatasetCard.read(card)
+    for key in ("seed", "exploration", "shift", "options", "factors"):
+        assert getattr(made, key) == getattr(card, key), key
+    assert made.splits["train"] == card.splits["train"]
+    assert made.environment.frame_size == card.environment.frame_size
 
 
 @pytest.mark.parametrize("name", shipped())
