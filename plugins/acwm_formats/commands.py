@@ -167,6 +167,11 @@ def _label_latent(
         action = zip(done.card.source["tied"]["actions"], tied.explained, strict=True)
         for name, share in action:
             click.echo(_explained(name, share))
+        if tied.mean < 0.5:
+            click.echo(
+                "less than half is explained: what torques or absolute targets do depends on the "
+                "scene, which a map of latent actions alone does not know"
+            )
     click.echo(f"{out} holds {done.card.splits['train']} training episodes")
     click.echo(f"next: acwm fit small {shlex.quote(f'data.path={out}')}")
 

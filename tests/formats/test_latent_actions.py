@@ -136,6 +136,7 @@ def test_the_command_names_what_is_missing_and_what_it_wrote(few, tmp_path):
     assert "of 5 codes," in told.output
     assert "recorded actions of 1 held-out episodes" in told.output
     assert "  right: R² " in told.output
+    assert "less than half is explained: what torques" in told.output
     info = CliRunner().invoke(main, ["data", "info", str(out), "--json"])
     assert json.loads(info.output)["source"]["tied"]["from"] == "few"
     told = run("--out", str(out), "--latent", "1")

@@ -13,6 +13,7 @@ from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import RecipeError
 from acwm_core.recipe import Recipe
 from acwm_formats.arrays import Recording, write_dataset
+from acwm_formats.inverse.latent_label import label_latent
 from acwm_play.pool import WorldPool
 from acwm_play.worlds import playable
 from tests.browsing import DESK
@@ -40,6 +41,11 @@ def run(tmp_path_factory):
     card = DatasetCard.read(folder / "data")
     shown = replace(card.environment, views=("cameras.top", "cameras.wrist"))
     replace(card, environment=shown).write(folder / "data")
+    return follower_of(folder / "data", folder / "run")
+
+
+def follower_of(data, folder):
+    """A run on some data of the model that draws a disc where actions point."""
     follower.register()
     recipe = Recipe.from_dict(
         {
@@ -47,10 +53,10 @@ def run(tmp_path_factory):
             "model": {"name": "follower"},
             "conditioner": {"name": "raw"},
             "objective": {"name": "regression"},
-            "data": {"path": str(folder / "data"), "clip_frames": 9},
+            "data": {"path": str(data), "clip_frames": 9},
         }
     )
-    return save_run(folder / "run", recipe, DatasetCard.read(folder / "data"))
+    return save_run(folder, recipe, DatasetCard.read(data))
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +64,32 @@ def pool(run):
     made = WorldPool(playable([run]))
     yield made
     asyncio.run(made.close())
+
+
+@pytest.mark.ci
+def test_the_keys_of_any_actions_send_latent_ones(tmp_path):
+    """Of a model of data whose actions were learnt: a key is a level of one of them."""
+    action = ActionSpec(("x", "y"), ("", ""), (-1, -1), (1, 1), "absolute")
+    splits = {"train": [recording(0), recording(1)]}
+    write_dataset(tmp_path / "data", splits, name="mine", action=action, fps=10, progress=False)
+    label_latent(tmp_path / "data", tmp_path / "latent", 2, steps=1, progress=False)
+    pool = WorldPool(playable([follower_of(tmp_path / "latent", tmp_path / "run")]))
+
+    async def story(page, client):
+        await page.say("open", index=0)
+        await page.next()
+        first, second = page.seen["world"]["controls"]
+        assert (first["name"], first["keys"]) == ("latent_0", ["ArrowLeft", "ArrowRight"])
+        assert (second["low"], second["high"], second["holds"]) == (-2, 2, False)
+        await page.say("act", values=[1.0, 0.0])  # half of the way to the bound
+        await page.until(
+            lambda found: abs(white(found[2][-1])[0] / 64 - (0.5 + 0.5 * 0.388)) < 0.03
+        )
+
+    try:
+        played(pool, tmp_path / "takes", story)
+    finally:
+        asyncio.run(pool.close())
 
 
 def test_the_person_drives_the_model_and_the_recording_goes_on(pool, tmp_path):

@@ -185,9 +185,9 @@ def explained(wanted: Floats, found: Floats, variance: Floats) -> Floats:
     return shares.astype(np.float32)
 
 
-def small(video: NDArray[np.uint8]) -> Tensor:
-    """Frames `[T, 3, H, W]` uint8, averaged down by a whole factor to about `SIDE` rows."""
-    factor = max(1, min(video.shape[2:]) // SIDE)
+def small(video: NDArray[np.uint8], side: int = SIDE) -> Tensor:
+    """Frames `[T, 3, H, W]` uint8, averaged down by a whole factor to about `side` rows."""
+    factor = max(1, min(video.shape[2:]) // side)
     frames = torch.tensor(video)
     if factor == 1:
         return frames
