@@ -197,7 +197,7 @@ def encode_truth(place: Place) -> None:
     codec = acwm.load(place.world).world_model.codec
     for line in (place.tasks / "index.jsonl").read_text().splitlines():
         task = json.loads(line)
-        first = np.asarray(Image.open(place.tasks / task["images"][0]))
+        first = np.asarray(Image.open(place.tasks / task["images"][0], formats=["PNG"]))
         frames = np.repeat(first[None], task["frames"], 0)
         if not task["branch"]:
             split, number = task["id"].split("/")[1].rsplit("-", 1)

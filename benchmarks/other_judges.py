@@ -119,7 +119,7 @@ def dependence(
     values = list[float]()
     for context in contexts:
         ends = [sorted((predictions / name).glob("*.png"))[-1] for name, _ in context]
-        predicted = [pooled(np.asarray(Image.open(end))).tolist() for end in ends]
+        predicted = [pooled(np.asarray(Image.open(end, formats=["PNG"]))).tolist() for end in ends]
         true = [frame.tolist() for _, frame in context]
         result = action_dependence_permutation_vectors(
             predicted_endpoints=predicted, truth_endpoints=true
