@@ -25,7 +25,10 @@ LARGE = replace(TAKES, size=(96, 128))
 """As a camera takes them: larger than a small model's frames."""
 
 
-ELSEWHERE = ("data import rlds", "data import videos films", "data label")
+ELSEWHERE = (
+    *("data import rlds", "data import videos films", "data label"),
+    *("fit small data.path=data/latent", "play"),
+)
 """Commands on data that only their own tests have."""
 
 
@@ -69,7 +72,7 @@ def test_every_step_works(desk):
         exec(compile(code, "walk", "exec"), {"__name__": "walk"})
     made = {path.parent.name for path in Path("data").rglob("card.yaml")}
     shown = set(re.findall(r"--out data/(\w+)", text))
-    elsewhere = {"published", "bridge", "films", "labelled"}
+    elsewhere = {"published", "bridge", "films", "labelled", "latent"}
     assert made == {*shown, "arm", "cubes", "reacher"} - elsewhere
     assert DatasetCard.read("data/arm").splits == {"train": 2, "ind_test": 2}
     assert Path("runs/small/report.html").is_file()
