@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-WRAPPED = 14
+_WRAPPED = 14
 """Width of the column of names that wrap."""
 
 
@@ -55,7 +55,7 @@ def print_table(
         grid.columns[0].no_wrap, grid.columns[0].overflow = False, "fold"  # a name is never cut
         if close:
             grid.padding, grid.pad_edge = (0, 1, 0, 0), False
-            grid.columns[0].max_width = WRAPPED if wraps else None
+            grid.columns[0].max_width = _WRAPPED if wraps else None
         for name, cells in rows:
             grid.add_row(name, *(cells[column] for column in columns))
         return grid
