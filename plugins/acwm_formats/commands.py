@@ -148,7 +148,7 @@ def _label_latent(
     from acwm_formats.inverse.latent_label import label_latent
 
     done = label_latent(path, out, dimensions, labelled, **options)
-    quality, tied = done.quality, done.tie
+    quality, decoder = done.quality, done.decoder
     click.echo(
         f"changes between frames of {quality.episodes} held-out episodes: {quality.explained:.0%} "
         f"predicted with their latent actions, {quality.shuffled:.0%} with those of other moments"
@@ -159,15 +159,15 @@ def _label_latent(
             "the latent actions have collapsed: nearly all moments have one code, so they say "
             "nothing; raise --steps, or choose another --seed"
         )
-    if tied is not None:
+    if decoder is not None:
         click.echo(
-            f"recorded actions of {tied.episodes} held-out episodes, from latent ones by a linear "
-            f"map that was fitted to {tied.recorded} others:"
+            f"recorded actions of {decoder.episodes} held-out episodes, from latent ones by a "
+            f"linear map that was fitted to {decoder.recorded} others:"
         )
-        action = zip(done.card.source["tied"]["actions"], tied.explained, strict=True)
+        action = zip(done.card.source["action_decoder"]["actions"], decoder.explained, strict=True)
         for name, share in action:
             click.echo(_explained(name, share))
-        if tied.mean < 0.5:
+        if decoder.mean < 0.5:
             click.echo(
                 "less than half is explained: what torques or absolute targets do depends on the "
                 "scene, which a map of latent actions alone does not know"

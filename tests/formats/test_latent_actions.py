@@ -14,9 +14,9 @@ from acwm_core.env.environment import ActionSpec
 from acwm_core.errors import DataError
 from acwm_formats.arrays import write_dataset
 from acwm_formats.check import check_dataset
+from acwm_formats.inverse.action_decoder import ActionDecoder
 from acwm_formats.inverse.latent_label import label_latent
 from acwm_formats.inverse.latent_network import HIGHEST, LatentDynamics, change
-from acwm_formats.inverse.latent_reader import Tie
 from acwm_formats.timeline import Recording
 from acwm_play.layout import controls
 
@@ -91,14 +91,14 @@ def test_codes_say_which_way_the_square_goes(done, videos):
 def test_the_tie_gives_the_recorded_actions_of_other_episodes(done, videos):
     """What the card holds is enough to compute them, without any of acwm's code."""
     codes, ways = codes_and_ways(done[0], videos, "ind_test")
-    tied = DatasetCard.read(done[0]).source["tied"]
+    decoder = DatasetCard.read(done[0]).source["action_decoder"]
     levels = np.concatenate([np.eye(5)[codes[:, k] + HIGHEST] for k in range(2)], 1)
-    actions = levels @ np.array(tied["weights"]).T + tied["offset"]
+    actions = levels @ np.array(decoder["weights"]).T + decoder["offset"]
     wanted = WAYS[ways]
     explained = 1 - ((actions - wanted) ** 2).mean(0) / wanted.var(0)
     assert explained.min() > 0.8
-    assert min(done[1].tie.explained) > 0.7
-    assert (tied["actions"], tied["from"]) == (["right", "down"], "few")
+    assert min(done[1].decoder.explained) > 0.7
+    assert (decoder["actions"], decoder["from"]) == (["right", "down"], "few")
 
 
 @pytest.mark.ci
@@ -138,7 +138,7 @@ def test_the_command_names_what_is_missing_and_what_it_wrote(few, tmp_path):
     assert "  right: R² " in told.output
     assert "less than half is explained: what torques" in told.output
     info = CliRunner().invoke(main, ["data", "info", str(out), "--json"])
-    assert json.loads(info.output)["source"]["tied"]["from"] == "few"
+    assert json.loads(info.output)["source"]["action_decoder"]["from"] == "few"
     told = run("--out", str(out), "--latent", "1")
     assert (told.exit_code, "already exists" in told.output) == (2, True)
 
@@ -181,8 +181,8 @@ def test_a_linear_relation_of_levels_and_actions_is_recovered():
     latents = rng.integers(-2, 3, (4000, 2)).astype(np.float32)
     curve = np.array([3.0, -1, 0, 5, 2])
     true = np.stack([curve[latents[:, 0].astype(int) + 2], 2 * latents[:, 1] + 7], 1)
-    tie = Tie.fit(latents, (true + rng.normal(0, 0.1, true.shape)).astype(np.float32))
-    assert np.abs(tie(latents) - true).max() < 0.05
+    decoder = ActionDecoder.fit(latents, (true + rng.normal(0, 0.1, true.shape)).astype(np.float32))
+    assert np.abs(decoder(latents) - true).max() < 0.05
 
 
 def test_a_latent_is_a_whole_number_with_a_gradient():

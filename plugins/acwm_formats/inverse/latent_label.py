@@ -16,12 +16,12 @@ from acwm_core.env.environment import ActionSpec, EnvironmentCard
 from acwm_core.env.episode import Episode, EpisodeSpec, Split
 from acwm_core.errors import DataError
 from acwm_core.executors import LocalExecutor
+from acwm_formats.inverse.action_decoder import DecoderQuality
 from acwm_formats.inverse.label import SHARD_EPISODES, check_alike
 from acwm_formats.inverse.latent_network import HIGHEST
 from acwm_formats.inverse.latent_reader import (
     LatentQuality,
     LatentReader,
-    TieQuality,
     check_lengths,
 )
 
@@ -36,12 +36,12 @@ class LatentLabelled:
     Attributes:
         card: of the dataset that was written.
         quality: what the latent actions say of held-out episodes.
-        tie: how they relate to recorded actions; None if none were given.
+        decoder: how they relate to recorded actions; None if none were given.
     """
 
     card: DatasetCard
     quality: LatentQuality
-    tie: TieQuality | None
+    decoder: DecoderQuality | None
 
 
 def label_latent(
@@ -81,18 +81,18 @@ def label_latent(
     for split in splits.values():
         check_lengths(split, least=2 if split.split == "train" else 0)
     reader = LatentReader(episodes, dimensions, steps=steps, seed=seed, progress=progress)
-    tie = None if recorded is None else reader.tie(recorded)
-    card = _card(episodes, recorded, reader, tie)
+    decoder = None if recorded is None else reader.fit_decoder(recorded)
+    card = _card(episodes, recorded, reader, decoder)
     card = replace(card, source={**card.source, "steps": steps, "seed": seed})
     written = fill(Path(out), card, _Source(splits, reader), LocalExecutor(0), progress=progress)
-    return LatentLabelled(written, reader.quality, tie)
+    return LatentLabelled(written, reader.quality, decoder)
 
 
 def _card(
     episodes: EpisodeDataset,
     recorded: EpisodeDataset | None,
     reader: LatentReader,
-    tie: TieQuality | None,
+    decoder: DecoderQuality | None,
 ) -> DatasetCard:
     old, size = episodes.card, reader.dimensions
     quality = reader.quality
@@ -109,14 +109,14 @@ def _card(
         "held_out": asdict(quality),
         "notes": [note],
     }
-    if recorded is not None and tie is not None:
-        source["tied"] = {
+    if recorded is not None and decoder is not None:
+        source["action_decoder"] = {
             "from": recorded.path.resolve().name,
             "checksum": recorded.checksum,
             "actions": [*recorded.card.environment.action.names],
-            "explained": [None if np.isnan(share) else share for share in tie.explained],
-            "weights": tie.tie.weights.tolist(),
-            "offset": tie.tie.offset.tolist(),
+            "explained": [None if np.isnan(share) else share for share in decoder.explained],
+            "weights": decoder.decoder.weights.tolist(),
+            "offset": decoder.decoder.offset.tolist(),
         }
     return DatasetCard(
         environment=_with_latent_actions(old.environment, size),

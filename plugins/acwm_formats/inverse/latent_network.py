@@ -1,4 +1,4 @@
-"""The networks that learn latent actions: what two frames need to be told apart, and no more.
+"""The networks that learn latent actions: what two frames need to be distinguished, and no more.
 
 One reads a few whole numbers from the frames around a moment; another predicts the next frame from
 the last two and these numbers (Schmidt and Jiang 2024, arXiv 2312.10812). The numbers are levels of
@@ -36,7 +36,7 @@ class LatentDynamics(nn.Module):
         super().__init__()
         self.inverse = InverseDynamics(dimensions)
         self.spread = nn.BatchNorm1d(dimensions, affine=False)  # otherwise all end at one level
-        self.told = nn.Sequential(nn.Linear(dimensions, 128), nn.SiLU())
+        self.embed = nn.Sequential(nn.Linear(dimensions, 128), nn.SiLU())
         self.down, self.up, self.shift = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for inner, outer in itertools.pairwise(WIDTHS):
             layers = nn.Conv2d(inner, outer, 3, 2, 1), nn.GroupNorm(8, outer), nn.SiLU()
@@ -58,13 +58,13 @@ class LatentDynamics(nn.Module):
         """The change to the next frame by these latent actions, `[B, 3, h, w]`; see `change`."""
         pixels = frames[:, : HERE + 1].float() / 127.5 - 1
         seen = torch.cat([pixels[:, HERE], CHANGE * (pixels[:, HERE] - pixels[:, HERE - 1])], 1)
-        told, skips = self.told(latents), list[Tensor]()
+        embedded, skips = self.embed(latents), list[Tensor]()
         for layer in self.down:
             skips.append(seen)
             seen = layer(seen)
         parts = [*zip(skips, self.up, self.shift, strict=True)]
         for skip, layer, shift in reversed(parts):
-            scale, offset = shift(told)[..., None, None].chunk(2, 1)
+            scale, offset = shift(embedded)[..., None, None].chunk(2, 1)
             wide = nn.functional.interpolate(seen * (1 + scale) + offset, size=skip.shape[2:])
             seen = nn.functional.silu(layer(torch.cat([wide, skip], 1)))
         return self.draw(seen)

@@ -14,15 +14,14 @@ from torch import Tensor
 from acwm_core.data.clips import hold_out
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
-from acwm_core.executors import progress_bar
 from acwm_formats.inverse.network import InverseDynamics, loss_of, window
+from acwm_formats.inverse.training import BATCH, Moment, train_on_moments
 
 Floats = NDArray[np.float32]
 
 SIDE, MOST_FRAMES = 64, 30_000
 """Rows or columns to which larger frames are averaged; how many labelled frames are used."""
 
-BATCH, RATE = 32, 2e-3
 STILL = 1e-6
 """Deviation, as a share of the largest action, below which a dimension never changes."""
 
@@ -137,24 +136,14 @@ class ActionReader:
         seed: int,
         progress: bool,
     ) -> None:
-        moments = [(e, k) for e, rows in enumerate(actions) for k in range(len(rows))]
-        optimiser = torch.optim.AdamW(self._network.parameters(), RATE, weight_decay=0.01)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, steps, pct_start=0.1)
-        rng = torch.Generator().manual_seed(seed)
-        with progress_bar("learning actions", steps, shown=progress) as report:
-            for _ in range(steps):
-                places = torch.randint(len(moments), (BATCH,), generator=rng).tolist()
-                batch = [moments[place] for place in places]
-                seen = torch.stack([window(frames[e], k) for e, k in batch])
-                rows = np.stack([actions[e][k] for e, k in batch])
-                wanted = torch.from_numpy((rows - self._mean) / self._std)
-                mean, log_variance = self._network(seen)
-                loss = loss_of(mean, log_variance, wanted)
-                optimiser.zero_grad()
-                loss.backward()
-                optimiser.step()
-                schedule.step()
-                report(1)
+        def loss_of_batch(seen: Tensor, batch: Sequence[Moment]) -> Tensor:
+            rows = np.stack([actions[e][k] for e, k in batch])
+            wanted = torch.from_numpy((rows - self._mean) / self._std)
+            mean, log_variance = self._network(seen)
+            return loss_of(mean, log_variance, wanted)
+
+        options = {"steps": steps, "seed": seed, "progress": progress}
+        train_on_moments(self._network, frames, loss_of_batch, what="learning actions", **options)
 
     def _tested(self, episodes: EpisodeDataset, held: Sequence[int]) -> Quality:
         """Measure it on held-out episodes, and scale the variances to the errors there."""
