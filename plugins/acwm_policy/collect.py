@@ -133,10 +133,8 @@ class Collection:
 def packed(episodes: EpisodeDataset, spec: EpisodeSpec) -> Packed:
     """An episode of another dataset as its shard has it."""
     shard = episodes.shard_of(spec.index)
-    reader, position = (
-        open_shard(episodes.shard_path(shard)),
-        spec.index - episodes.shards[shard][0],
-    )
+    reader = open_shard(episodes.shard_path(shard))
+    position = spec.index - episodes.shards[shard][0]
     members = {name: reader.read(position, name) for name in MEMBERS}
     return Packed(spec, episodes.actions(spec.index), members)
 
