@@ -35,11 +35,13 @@ WORLDS = (
 )  # fmt: skip
 SPLITS = ("ind_test", "ood_test")
 ENTRIES = Path(__file__).parents[1] / "examples" / "entries"
-EPISODES, TESTS, BRANCHED = 300, 16, 4
+EPISODES, TESTS, BRANCHED = 160, 16, 2
 """Training episodes; test episodes per split; those of them with other actions."""
 
 MINUTES = 6.0
 """CPU-minutes of training of the programs in `examples/entries`."""
+
+BUDGET = ("--minutes", str(MINUTES), "--seed", "{seed}")
 
 SETTINGS = (
     "training.cpu_threads=1", "training.sample_every_n_steps=0", "data.validation_episodes=8",
@@ -124,10 +126,8 @@ ACWM = [sys.executable, "-m", "acwm_core.cli"]
 
 METHODS: dict[str, tuple[str, Callable[[Place], list[list[str]]]]] = {
     "nearest": ("nearest neighbour", program("nearest")),
-    "simvp": (
-        "SimVP (next frame)", program("simvp", "--minutes", str(MINUTES), "--seed", "{seed}")
-    ),
-    "edm": ("EDM (DIAMOND)", program("edm_unet", "--minutes", str(MINUTES), "--seed", "{seed}")),
+    "simvp": ("SimVP (next frame)", program("simvp", *BUDGET)),
+    "edm": ("EDM (DIAMOND, half its width)", program("edm_unet", "--channels", "32", *BUDGET)),
     "dit": ("diffusion forcing, `dit_xs`", trained(1100)),
     "next_frame": ("denoised next frame", trained(1100, "+next_frame")),
     "grid": ("grid, `+recurrent`", trained(1000, "+recurrent")),

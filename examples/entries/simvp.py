@@ -16,6 +16,7 @@ import json
 import tarfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -26,6 +27,9 @@ from torch.nn import functional
 
 GIVEN = 2
 """Frames that the next one is predicted from; at the beginning the first one, twice."""
+
+SCENES, LEARNT = 8, 2
+"""Scenes that are predicted side by side, and the frames of each that a step learns."""
 
 
 def training_episodes(data: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -73,9 +77,7 @@ class Inception(nn.Module):
 class NextFrame(nn.Module):
     """Encoder, translator and decoder; frames are `[B, 3, H, W]` in [0, 1]."""
 
-    def __init__(
-        self, actions: int, channels: int = 32, hidden: int = 128, blocks: int = 4
-    ) -> None:
+    def __init__(self, actions: int, channels: int = 32, hidden: int = 64, blocks: int = 4) -> None:
         super().__init__()
         self.first = layer(3 * GIVEN, channels)
         self.down = nn.Sequential(layer(channels, channels, 2), layer(channels, hidden, 2))
@@ -98,6 +100,23 @@ class NextFrame(nn.Module):
         return frames[-1] + self.head(torch.cat([self.up(grid), skip], 1))
 
 
+@dataclass
+class Scene:
+    """A training episode on which the network moves on.
+
+    Args:
+        video: true frames `[T, 3, H, W]` in [0, 1].
+        actions: its normalised actions `[T, A]`.
+        frame: number of the last frame.
+        last: the last two frames `[2, 3, H, W]`, true or predicted.
+    """
+
+    video: Tensor
+    actions: Tensor
+    frame: int
+    last: Tensor
+
+
 class Entry:
     """The network with the scale of the actions."""
 
@@ -112,36 +131,35 @@ class Entry:
         """Actions `[T, A]` in their standard deviations."""
         return torch.from_numpy(((actions - self.mean) / self.scale).astype(np.float32))
 
-    def rolled(self, given: Tensor, actions: Tensor) -> Tensor:
-        """Frames `[B, T, 3, H, W]` after a given one `[B, 3, H, W]`, by actions `[B, T, A]`."""
-        frames = [given] * GIVEN
+    def rolled(self, frames: list[Tensor], actions: Tensor) -> list[Tensor]:
+        """These frames `[B, 3, H, W]` and the following ones, by actions `[B, T, A]`."""
         for action in actions.unbind(1):
-            frames.append(self.network(frames, action).clamp(-0.2, 1.2))
-        return torch.stack(frames[GIVEN:], 1)
+            frames = [*frames, self.network(frames, action).clamp(-0.2, 1.2)]
+        return frames
 
-    def batch(self, size: int, unrolled: int) -> tuple[Tensor, Tensor]:
-        """Clips `[B, 1 + T, 3, H, W]` and their actions `[B, T, A]`, from anywhere in episodes."""
-        clips, moves = [], []
-        for _ in range(size):
-            video, actions = self.episodes[self.random.integers(len(self.episodes))]
-            start = self.random.integers(max(1, len(video) - unrolled))
-            rows = np.minimum(np.arange(start, start + unrolled + 1), len(video) - 1)
-            clips.append(video[rows])
-            moves.append(self.normalised(actions[rows[:-1]]))
-        pixels = torch.from_numpy(np.stack(clips)).permute(0, 1, 4, 2, 3) / 255
-        return pixels, torch.stack(moves)
+    def scene(self) -> Scene:
+        """An episode from anywhere in it, before anything is predicted."""
+        video, actions = self.episodes[self.random.integers(len(self.episodes))]
+        frame = int(self.random.integers(len(video) - LEARNT))
+        pixels = torch.from_numpy(video).permute(0, 3, 1, 2) / 255
+        return Scene(pixels, self.normalised(actions), frame, pixels[[max(0, frame - 1), frame]])
 
     def train(self, minutes: float, steps: int | None, rate: float = 1e-3) -> int:
-        """Steps until so many CPU-minutes are over; windows get longer, from 2 to 10 frames."""
+        """Steps until so many CPU-minutes are over; scenes begin anew ever less often."""
         optimizer = torch.optim.AdamW(self.network.parameters(), rate)
         begun, step, share = time.process_time(), 0, 0.0
+        scenes = [self.scene() for _ in range(SCENES)]
         while share < 1:
             spent = (time.process_time() - begun) / 60 / max(minutes, 1e-9)
             share = step / steps if steps is not None else spent
             for group in optimizer.param_groups:
                 group["lr"] = rate * min(1, (step + 1) / 50, 1.02 - min(share, 1))
-            pixels, actions = self.batch(8, 2 + int(8 * min(share, 1)))
-            error = functional.mse_loss(self.rolled(pixels[:, 0], actions), pixels[:, 1:])
+            goes_on = self.random.random(SCENES) < 0.5 + 0.5 * share
+            scenes = [
+                scene if kept and scene.frame + LEARNT < len(scene.video) else self.scene()
+                for scene, kept in zip(scenes, goes_on, strict=True)
+            ]
+            error = self.error(scenes)
             optimizer.zero_grad()
             error.backward()
             nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -151,12 +169,24 @@ class Entry:
                 print(f"step {step}, {share:.0%}: squared error {error:.5f}", flush=True)
         return step
 
+    def error(self, scenes: list[Scene]) -> Tensor:
+        """The squared error of the next frames of scenes, which move on by what was predicted."""
+        last = list(torch.stack([scene.last for scene in scenes]).unbind(1))
+        moves = [scene.actions[scene.frame : scene.frame + LEARNT] for scene in scenes]
+        frames = self.rolled(last, torch.stack(moves))
+        true = [scene.video[scene.frame + 1 : scene.frame + 1 + LEARNT] for scene in scenes]
+        for number, scene in enumerate(scenes):
+            scene.last = torch.stack([frame[number] for frame in frames[-GIVEN:]]).detach()
+            scene.frame += LEARNT
+        return functional.mse_loss(torch.stack(frames[GIVEN:], 1), torch.stack(true))
+
     @torch.no_grad()
     def predict(self, given: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """All frames of a clip `[T, H, W, 3]`, the given ones first."""
         first = torch.from_numpy(given[-1:]).permute(0, 3, 1, 2) / 255
         rows = self.normalised(actions[len(given) - 1 : -1])[None]
-        pixels = self.rolled(first, rows)[0].clamp(0, 1).permute(0, 2, 3, 1)
+        frames = torch.cat(self.rolled([first] * GIVEN, rows)[GIVEN:])
+        pixels = frames.clamp(0, 1).permute(0, 2, 3, 1)
         return np.concatenate([given, (255 * pixels).round().byte().numpy()])
 
 
