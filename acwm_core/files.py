@@ -193,7 +193,7 @@ def writing(path: Path, instead: str = "") -> Generator[None]:
         ) from error
 
 
-def writable(path: Path, *, folder: bool = False) -> Path:
+def writable(path: Path, *, folder: bool = False, option: str = "") -> Path:
     """Return `path` if it can be written. Call it before the work whose result goes there.
 
     Nothing is created; parent folders may still be missing.
@@ -201,10 +201,12 @@ def writable(path: Path, *, folder: bool = False) -> Path:
     Args:
         path: a file, which may or may not exist.
         folder: whether `path` is a folder instead.
+        option: the option of the command that chooses another place, for the message.
 
     Raises:
         DataError: it cannot be written; says why.
     """
+    elsewhere = f"choose another place{f' with {option}' if option else ''}"
     try:
         if path.is_dir() and not folder:
             raise DataError(f"{path} is a folder: name a file in it to write to")
@@ -212,12 +214,12 @@ def writable(path: Path, *, folder: bool = False) -> Path:
         while not os.path.lexists(place):
             place = place.parent
         if not place.is_dir():
-            raise DataError(f"cannot write {path}: {place} is not a folder; choose another place")
+            raise DataError(f"cannot write {path}: {place} is not a folder; {elsewhere}")
         with tempfile.TemporaryFile(dir=place):  # permissions alone do not tell
             return path
     except OSError as error:
         why = error.strerror or str(error)
-        raise DataError(f"{path} cannot be written ({why}): choose another place") from error
+        raise DataError(f"{path} cannot be written ({why}): {elsewhere}") from error
 
 
 def remove_partial(folder: Path, of: str = "") -> None:

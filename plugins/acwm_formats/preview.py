@@ -76,7 +76,7 @@ def preview(
         DataError: there is no dataset, it is unfinished, none of the episodes can be read, or `out`
             cannot be written.
     """
-    out = writable(Path(out), folder=True)
+    out = writable(Path(out), folder=True, option="--out")
     card = DatasetCard.read(path)
     first = list(_first_episodes(path, card, episodes))
     if not first:

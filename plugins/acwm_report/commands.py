@@ -10,6 +10,7 @@ import click
 
 from acwm_core.cli.arguments import DATASET, FOLDER, OUT_FILE, OUT_FOLDER, RUN, Run
 from acwm_core.errors import RecipeError
+from acwm_core.files import writable
 from acwm_report.terminal import print_severity, print_summary
 
 
@@ -195,7 +196,8 @@ def data_report(path: Path, out: Path | None) -> None:
     from acwm_formats.survey.survey import short_form, survey
     from acwm_report.data_page import write_data_report
 
+    page = writable(out or path / "report.html", option="--out")
     found = survey(path)
     for line in short_form(found)[:-1]:
         click.echo(line)
-    click.echo(write_data_report(found, out or path / "report.html"))
+    click.echo(write_data_report(found, page))

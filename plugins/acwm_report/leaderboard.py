@@ -8,7 +8,7 @@ from pathlib import Path
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError
 from acwm_core.evaluation.results import FOLDER, SUMMARY, Summary
-from acwm_core.files import regular_file
+from acwm_core.files import regular_file, writable
 from acwm_planning.results import PLANS
 from acwm_report.boards import boards_of
 from acwm_report.cards import cards_of, entry_facts
@@ -56,7 +56,7 @@ def write_leaderboard(
         broken = "; ".join(f"{name}: {why}" for name, why in found.broken.items())
         reason = f" that can be read ({broken})" if broken else ""
         raise DataError(f"{folder} holds no results{reason}: run `acwm evaluate` on runs in it")
-    out = Path(out) if out else folder / "leaderboard.html"
+    out = writable(Path(out) if out else folder / "leaderboard.html", option="--out")
     boards = boards_of(found.entries, found.uses)
     cards = cards_of(boards, found.entries, found.about, found.folders, megabytes)
     return write_page(

@@ -79,7 +79,7 @@ def write_report(
         The path of the file.
     """
     folders = _checked(runs, experiment)
-    out = writable(Path(out) if out else folders[0] / "report.html")
+    out = writable(Path(out) if out else folders[0] / "report.html", option="--out")
     return _write_text(out, of_readable(folders, partial(_drawn, megabytes, experiment)))
 
 

@@ -14,7 +14,6 @@ from acwm_report.titles import counted, short_title
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from acwm_core.evaluation.protocol import PublishedRow
     from acwm_core.evaluation.results import (
@@ -237,13 +236,12 @@ def about_published(summary: Summary) -> str:
 
 def print_comparison(comparison: Comparison) -> None:
     """Print which runs differ: a table per split, their usefulness, and warnings."""
-    from rich.console import Console
-
     # A, B … Z, then A1, B1 …, because run names are too long for a table in a terminal
     letters = {run: f"{chr(65 + n % 26)}{n // 26 or ''}" for n, run in enumerate(comparison.runs)}
     for label, letter in letters.items():
         click.echo(f"{letter}: {label}")
-    print_tables(Console(highlight=False, markup=False), comparison, letters)
+    console = _console()
+    print_tables(console, comparison, letters)
     corrected = f"corrected for {counted(comparison.tests, 'comparison')} (Holm)"
     if not comparison.tests:
         corrected = "none, because there are too few episodes"
@@ -251,26 +249,21 @@ def print_comparison(comparison: Comparison) -> None:
         "difference: second − first, mean per episode, with its 95 % interval; wins: episodes in "
         f"which the second is better; p: {corrected}; better: significantly, p < 0.05"
     )
-    _print_uses(Console(highlight=False, markup=False), comparison, letters)
+    _print_uses(console, comparison, letters)
     for warning in comparison.warnings:
         click.echo(f"warning: {warning}", err=True)
 
 
 def print_tables(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
-    """Print a table per split; on a narrow terminal, long names and intervals wrap."""
+    """Print a table per split; on a narrow terminal, columns that do not fit follow below."""
+    heads = ["difference", "95\N{NO-BREAK SPACE}%", "wins", "p", "better"]
     for split in dict.fromkeys(each.split for each in comparison.differences):
-        table = _wide_table(console, split)
-        table.add_column("metric", overflow="fold")
-        table.add_column("runs", no_wrap=True)
-        table.add_column("difference", justify="right", no_wrap=True)
-        table.add_column("95 %", justify="right", overflow="fold")
-        for name in ("wins", "p"):
-            table.add_column(name, justify="right", no_wrap=True)
-        table.add_column("better", no_wrap=True)
-        for each in comparison.differences:
-            if each.split == split:
-                table.add_row(*_line(each, comparison.units[each.metric], letters))
-        console.print(table)
+        rows = [
+            _line(each, comparison.units[each.metric], letters)
+            for each in comparison.differences
+            if each.split == split
+        ]
+        print_table(console, split, heads, rows, first="metric", close=True)
 
 
 def _print_uses(console: Console, comparison: Comparison, letters: Mapping[str, str]) -> None:
@@ -280,16 +273,13 @@ def _print_uses(console: Console, comparison: Comparison, letters: Mapping[str, 
     found = use_table(comparison.uses, [*comparison.runs])
     if found is None:
         return
-    table = _wide_table(console, found.title)
-    table.add_column("", overflow="fold")
-    for row in found.rows:
-        table.add_column(letters[row.title], justify="right", overflow="fold")
+    rows: list[tuple[str, list[str]]] = []
     for place, column in enumerate(found.columns):
         title = f"{column.group}, {column.title.lower()} {column.better} {column.unit}"
         cells = (row.cells[place] for row in found.rows)
-        values = (f"{c.text} ({c.interval})" if c.interval else c.text for c in cells)
-        table.add_row(" ".join(title.split()), *values)
-    console.print(table)
+        values = [f"{c.text} ({c.interval})" if c.interval else c.text for c in cells]
+        rows.append((" ".join(title.split()), values))
+    print_table(console, found.title, [letters[row.title] for row in found.rows], rows, close=True)
 
 
 def print_page_table(table: PageTable) -> None:
@@ -308,22 +298,16 @@ def print_page_table(table: PageTable) -> None:
 
 def print_ranking(ranking: Ranking) -> None:
     """Print the policies, best true score first, and how well the judges agree with the truth."""
-    from rich.console import Console
-
     from acwm_report.rankings import ranking_table
 
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal:  # a file or a pipe has no width
-        console.width = 200
-    table = _wide_table(console, "")
-    heads = ("success\n(true)", "(model)", "return\n(true)", "(model)")
-    for head in ("policy", "loop", *heads):
-        table.add_column(head, justify="right" if head in heads else "left")
+    console = _console()
+    rows: list[tuple[str, list[str]]] = []
     for policy in ranking.policies:
-        success = (f"{100 * policy.success[judge]:.0f} %" for judge in ("truth", "model"))
-        returns = (f"{policy.returns[judge]:.3g}" for judge in ("truth", "model"))
-        table.add_row(policy.policy, policy.loop, *success, *returns)
-    console.print(table)
+        success = [f"{100 * policy.success[judge]:.0f} %" for judge in ("truth", "model")]
+        returns = [f"{policy.returns[judge]:.3g}" for judge in ("truth", "model")]
+        rows.append((policy.policy, [policy.loop, *success, *returns]))
+    heads = ["loop", "success (true)", "success (model)", "return (true)", "return (model)"]
+    print_table(console, None, heads, rows, first="policy", close=True)
     for policy in ranking.policies:
         for judge, count in policy.unread.items():
             console.print(
@@ -335,17 +319,18 @@ def print_ranking(ranking: Ranking) -> None:
     click.echo("MMRV: mean maximum rank violation; optimism: judge minus truth")
 
 
-def _wide_table(console: Console, title: str) -> Table:
-    from rich.table import Table
+def _console() -> Console:
+    """Where tables go; a file or a pipe has no width, so a row is one line there."""
+    from rich.console import Console
 
-    if not console.is_terminal:  # a file or a pipe has no width: a line per row
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
         console.width = 10_000
-    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, title=title)
-    table.title_justify, table.title_style = "left", "bold"
-    return table
+    return console
 
 
-def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, ...]:
+def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
+    """Which metric and runs, and the cells of a difference."""
     pair = f"{letters[each.first]} → {letters[each.second]}"
     change = f"{each.difference:+.3g} {unit}".strip().replace("inf", "∞").replace("+nan", "–")
     known = each.low is not None and each.high is not None
@@ -354,4 +339,4 @@ def _line(each: Difference, unit: str, letters: Mapping[str, str]) -> tuple[str,
     p = "–" if each.p_corrected is None else f"{each.p_corrected:.2g}"
     none = "too few" if each.p is None and math.isfinite(each.difference) else "neither"
     better = letters[each.winner] if each.winner else none
-    return each.metric, pair, change, interval, wins, p, better
+    return f"{each.metric} {pair}", (change, interval, wins, p, better)

@@ -6,9 +6,11 @@ import shutil
 import av
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from conftest import EPISODES
 from PIL import Image
 
+from acwm_core.cli import main
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.errors import DataError
 from acwm_formats.preview import describe, preview
@@ -59,5 +61,18 @@ def test_the_preview_shows_every_split_with_masks_and_actions(square_data, tmp_p
 
 def test_a_place_that_cannot_be_written_is_told(square_data, tmp_path):
     (tmp_path / "preview").touch()
-    with pytest.raises(DataError, match="is not a folder; choose another place"):
+    with pytest.raises(DataError, match="is not a folder; choose another place with --out"):
         preview(square_data, tmp_path / "preview")
+
+
+@pytest.mark.parametrize("command", ["preview", "report"])
+def test_data_that_can_only_be_read_name_the_option(square_data, monkeypatch, command):
+    def read_only(**_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("acwm_core.files.tempfile.TemporaryFile", read_only)
+    done = CliRunner().invoke(main, ["data", command, str(square_data)])
+    assert done.exit_code == 2
+    assert done.stderr.endswith(
+        "cannot be written (Read-only file system): choose another place with --out\n"
+    )
