@@ -39,6 +39,8 @@ class LatentDistance(Cost):
             favours reaching the goal fast, and not only a good final frame.
     """
 
+    observes = False
+
     def __init__(self, *, frames: int | None = None) -> None:
         self.frames = frames
         last_frames(1, frames)
@@ -76,6 +78,8 @@ class StateDistance(Cost):
             what the task looks at.
     """
 
+    judged = True
+
     def __init__(
         self,
         *,
@@ -87,6 +91,7 @@ class StateDistance(Cost):
         if read not in ("model", "pictures", None):
             raise RecipeError(f"cost.read is {read!r}: give model, pictures or null")
         self.frames, self.read, self.failure, self.unknown = frames, read, failure, unknown
+        self.carried = read != "pictures"
         last_frames(1, frames)
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
@@ -135,6 +140,8 @@ class KeypointDistance(Cost):
     Raises:
         RecipeError: a negative weight.
     """
+
+    observes = False
 
     def __init__(self, *, frames: int | None = 3, features: float = 1.0) -> None:
         if not features >= 0:

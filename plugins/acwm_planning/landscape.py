@@ -20,7 +20,7 @@ from acwm_core.files import writing, written_whole
 from acwm_planning.controllers import PlanningController, PolicyController
 from acwm_planning.episode import play, spec_of_seed, start_of
 from acwm_planning.futures import GoalCost, History
-from acwm_planning.run import EpisodePlayer, make_cost, make_planner
+from acwm_planning.run import EpisodePlayer, make_planner
 
 MOMENT = 12
 """Actions of the solution before the moment, so that things move."""
@@ -62,8 +62,7 @@ def landscape(player: EpisodePlayer, seed: int) -> Landscape:
     history, true, still = _solved_so_far(player, seed)
     spec, environment = player.card.action, player.environment
     candidates, chosen, values = _candidates(true, spec)
-    own = make_cost(player.settings, player.card)
-    goal_cost = GoalCost(own, environment.task, environment.goal)
+    goal_cost = GoalCost(player.cost, environment.task, environment.goal)
     costs: dict[str, NDArray[np.float64]] = {}
     ranks: dict[str, float] = {}
     for judge in JUDGES:

@@ -90,12 +90,12 @@ class PicturePlanner:
         device: str = "auto",
         action_std: Sequence[float] | None = None,
     ) -> None:
-        if settings.cost["name"] == "state":
-            raise RecipeError(NO_TASK)
         self.card: EnvironmentCard = bundle.card
-        world = bundle.world_model.to(choose_device(device))
-        self._rollouts = ModelRollouts(world, self.card, None, **settings.rollouts())
         self._cost = make_cost(settings, self.card)
+        if self._cost.judged:
+            raise RecipeError(NO_TASK)
+        world = bundle.world_model.to(choose_device(device))
+        self._rollouts = ModelRollouts(world, self.card, None, **settings.rollouts(self._cost))
         self._controller = PlanningController(
             make_planner(settings), self._rollouts, self._cost, action_std=action_std
         )

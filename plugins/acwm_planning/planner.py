@@ -93,19 +93,31 @@ class Futures(ABC):
 
 
 class Cost(ABC):
-    """Rates the distance of futures from the goal of a task."""
+    """Rates the distance of futures from the goal of a task.
+
+    Attributes:
+        observes: whether it may ask for what futures show (`Futures.observe`), which an estimator
+            reads in their pictures; it then differs through the codec.
+        carried: whether it takes states that the model carries on, where there are some, so that
+            planning starts from `state_past`.
+        judged: whether only a task with a known goal, and no picture of one, tells it what is near.
+    """
+
+    observes: bool = True
+    carried: bool = False
+    judged: bool = False
 
     @abstractmethod
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
         """Return a cost per candidate, `[N]`; lower is better, NaN is worst."""
 
-    def about(self, card: EnvironmentCard) -> Mapping[str, str]:
-        """What it depends on beside its parameters, by name; results keep and show it.
-
-        Args:
-            card: card of the environment to plan in.
+    def check(self, card: EnvironmentCard) -> None:  # noqa: B027 (most are of any environment)
+        """Refuse to plan in an environment, whose card this is.
 
         Raises:
             RecipeError: the cost is of another environment.
         """
+
+    def about(self) -> Mapping[str, str]:
+        """What it depends on beside its parameters, by name; results keep and show it."""
         return {}

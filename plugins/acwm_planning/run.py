@@ -57,6 +57,12 @@ class EpisodePlayer:
         settings: settings of planning.
         device: device of the model; ``"auto"`` takes a GPU if there is one.
         action_std: see `PlanningController`.
+
+    Attributes:
+        cost: the cost of the settings.
+
+    Raises:
+        RecipeError: the cost is of another environment.
     """
 
     def __init__(
@@ -75,7 +81,8 @@ class EpisodePlayer:
             goal_task = TaskVariant(goal_task, steps=steps, max_steps=limit)
         self.environment = TaskEnvironment(self._make_environment(), goal_task)
         self._branches: Environment | None = None
-        self._estimator = estimator_for(self.card) if settings.estimates else None
+        self.cost = make_cost(settings, self.card)
+        self._estimator = estimator_for(self.card) if self.cost.observes else None
 
     def play(self, row: str, seed: int) -> tuple[EpisodeResult, Controller]:
         """Play one episode; returns it with the controller that acted."""
@@ -92,12 +99,12 @@ class EpisodePlayer:
         if row in ("policy", "solution"):
             return PolicyController.scripted(solves=row == "solution")
         rollouts = self.rollouts() if row == "model" else self._simulator_rollouts(row == "codec")
-        cost = make_cost(self.settings, self.card)
-        return PlanningController(planner, rollouts, cost, action_std=self._action_std)
+        return PlanningController(planner, rollouts, self.cost, action_std=self._action_std)
 
     def rollouts(self) -> ModelRollouts:
         """The rollouts of the model."""
-        return ModelRollouts(self._world, self.card, self._estimator, **self.settings.rollouts())
+        parameters = self.settings.rollouts(self.cost)
+        return ModelRollouts(self._world, self.card, self._estimator, **parameters)
 
     def seconds(self, row: str, seed: int) -> float:
         """How long an episode takes at most, from a first decision; 0 without a planner."""
@@ -157,14 +164,14 @@ def make_cost(settings: Settings, card: EnvironmentCard | None = None) -> Cost:
     """
     cost: Cost = _create("cost", settings.cost, Cost)
     if card is not None:
-        cost.about(card)
+        cost.check(card)
     return cost
 
 
 def facts_of_cost(run: str | Path, settings: Settings) -> dict[str, str]:
     """What the cost of these settings depends on beside its parameters; see `Cost.about`."""
     card = DatasetCard.read(RunFolder(find_run(run)).card).environment
-    return {**make_cost(settings).about(card)}
+    return {**make_cost(settings, card).about()}
 
 
 def _create(kind: Any, choice: Mapping[str, Any], base: type[Any]) -> Any:

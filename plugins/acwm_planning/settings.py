@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Any, cast, get_type_hints
 
 from acwm_core.errors import RecipeError, suggest
+from acwm_core.plugins import catalog
 from acwm_core.recipe.check import check_component
 from acwm_core.recipe.compose import parse_override
 from acwm_core.recipe.types import checked, show
+
+if TYPE_CHECKING:
+    from acwm_planning.planner import Cost
 
 ROW_NAMES = ("model", "simulator", "codec", "solution", "policy", "random", "still")
 """What chooses the actions: the planner with the model; the same planner with the true simulator;
@@ -36,8 +40,8 @@ class Settings:
         planner: name and parameters of the planner.
         cost: name and parameters of the cost.
         past: see `ModelRollouts`.
-        state_past: as `past`, for `cost=state` and `cost=reward` with a model that carries states
-            on; null for `past`.
+        state_past: as `past`, for a cost that takes the states which a model carries on, such as
+            `cost=state`; null for `past`.
         steps: see `ModelRollouts`.
         batch: see `ModelRollouts`.
         max_steps: maximum number of actions in an episode; the task's own by default.
@@ -69,29 +73,21 @@ class Settings:
                 raise RecipeError(f"{name}={value}: give {minimum} or more")
 
     @property
-    def estimates(self) -> bool:
-        """Whether the cost may need states, which an estimator reads."""
-        return self.cost["name"] not in ("latent", "points")
-
-    @property
     def differentiates(self) -> bool:
         """Whether the planner needs gradients, which the simulator does not have."""
         return self.planner["name"] == "gradient"
 
-    def rollouts(self) -> dict[str, Any]:
-        """The parameters of `ModelRollouts`."""
-        reads_states = (
-            self.cost["name"] in ("state", "reward") and self.cost.get("read") != "pictures"
-        )
-        state_past = self.state_past if reads_states else None
+    def rollouts(self, cost: Cost) -> dict[str, Any]:
+        """The parameters of `ModelRollouts` for the cost of these settings."""
+        state_past = self.state_past if cost.carried else None
         parameters = {"past": self.past, "steps": self.steps, "batch": self.batch}
         return parameters | {"state_past": state_past}
 
     def rows(self, names: Collection[str]) -> list[str]:
         """The rows to play of those that are asked for, in the order of `ROW_NAMES`.
 
-        A cost on latents, or of what is read in them, is the same through the codec, so then there
-        is no such row.
+        A cost that observes no pictures is the same through the codec, so then there is no such
+        row.
 
         Raises:
             RecipeError: there is no such row.
@@ -99,7 +95,10 @@ class Settings:
         for row in names:
             if row not in ROW_NAMES:
                 raise RecipeError(f"unknown row {row!r}{suggest(row, ROW_NAMES)}")
-        return [row for row in ROW_NAMES if row in names and (row != "codec" or self.estimates)]
+        asked = {*names}
+        if "codec" in asked and not catalog().component("cost", self.cost["name"]).load().observes:
+            asked.remove("codec")
+        return [row for row in ROW_NAMES if row in asked]
 
     def to_dict(self) -> dict[str, Any]:
         """The settings that affect results, ready for JSON; the batch size does not."""

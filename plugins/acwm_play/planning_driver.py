@@ -47,10 +47,10 @@ class PlanningDriver(Driver):
     ) -> None:
         overrides = [] if steps is None else [f"steps={steps}"]
         settings = settings_of(overrides, declared=task.planning)
-        estimator = estimator_for(card) if settings.estimates else None
-        rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts())
-        self._card, self._task, self._rollouts = card, task, _InterruptibleRollouts(rollouts)
         planner, cost = make_planner(settings), make_cost(settings, card)
+        estimator = estimator_for(card) if cost.observes else None
+        rollouts = ModelRollouts(world_model, card, estimator, **settings.rollouts(cost))
+        self._card, self._task, self._rollouts = card, task, _InterruptibleRollouts(rollouts)
         self._controller = PlanningController(planner, self._rollouts, cost, action_std=action_std)
 
     def begin(self, goal: Goal, still: NDArray[np.float32], seed: int) -> None:

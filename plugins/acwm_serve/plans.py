@@ -62,11 +62,12 @@ class GoalPlanner:
     ) -> None:
         settings = settings_of([], declared=task.planning)
         self._card, self._task = card, task
-        reading = estimator if settings.estimates else None
+        cost = make_cost(settings, card)
+        reading = estimator if cost.observes else None
         self._controller = PlanningController(
             make_planner(settings),
-            ModelRollouts(world_model, card, reading, **settings.rollouts()),
-            make_cost(settings, card),
+            ModelRollouts(world_model, card, reading, **settings.rollouts(cost)),
+            cost,
             action_std=action_std,
         )
         self._aim: bytes | None = None

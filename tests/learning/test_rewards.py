@@ -20,6 +20,8 @@ from acwm_planning.rewards.cost import RewardCost
 from acwm_planning.rewards.head import RewardHead
 from acwm_planning.rewards.task import RewardTask
 from acwm_planning.rewards.training import train_reward
+from acwm_planning.run import make_cost
+from acwm_planning.settings import settings_of
 from acwm_policy.evaluate import evaluate_policy
 from acwm_policy.settings import PolicySettings
 from acwm_policy.train import train_policy
@@ -249,6 +251,9 @@ def test_another_world_or_reward_is_refused(run, head, tmp_path):
         )
     with pytest.raises(RecipeError, match="the reward is of slide, not of unread"):
         RewardTask.read(head, tiny.Unread.card)
+    settings = settings_of(["cost=reward", f"cost.head={head}"])
+    with pytest.raises(RecipeError, match="the reward is of slide, not of unread"):
+        make_cost(settings, tiny.Unread.card)
     (head / "reward.safetensors").rename(tmp_path / "reward.safetensors")
     try:
         with pytest.raises(DataError, match="holds no reward head"):

@@ -8,11 +8,15 @@ import torch
 
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.model.state_stream import StateStream
+from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_planning.futures import GoalCost, History, ModelFutures, ModelRollouts
+from acwm_planning.planner import Cost
+from acwm_planning.run import make_cost
 from acwm_planning.settings import settings_of
 from tests import tiny
 from tests.learning.test_scenes import arms
+from tests.plugins import plugin_of
 
 STILL = np.zeros(2, np.float32)
 
@@ -246,16 +250,37 @@ def test_states_that_are_not_finite_are_no_prediction(bundle, diverged):
 
 
 def test_only_a_model_that_carries_states_starts_as_far_back_as_these_may(history, bundle):
-    """And only for a cost of predicted states."""
-    state = settings_of(["cost=state", "past=1", "state_past=2"]).rollouts()
-    for settings, world, taken in (
-        (state, arms(2), 4),
-        (state, bundle.world_model, 2),
-        (settings_of(["cost=latent", "past=1", "state_past=2"]).rollouts(), arms(2), 2),
-        (settings_of(["cost=state", "past=1"]).rollouts(), arms(2), 2),
+    """And only for a cost that takes them."""
+    for words, world, taken in (
+        (["cost=state", "state_past=2"], arms(2), 4),
+        (["cost=state", "state_past=2"], bundle.world_model, 2),
+        (["cost=state", "cost.read=pictures", "state_past=2"], arms(2), 2),
+        (["cost=latent", "state_past=2"], arms(2), 2),
+        (["cost=state"], arms(2), 2),
     ):
-        given = ModelRollouts(world, bundle.card, None, **settings)._given(history, STILL)
+        settings = settings_of(["past=1", *words])
+        rollouts = settings.rollouts(make_cost(settings))
+        given = ModelRollouts(world, bundle.card, None, **rollouts)._given(history, STILL)
         assert given.actions.shape[1] == taken
+
+
+class Mine(Cost):
+    """A cost of a plugin, whose needs a test declares."""
+
+    def __call__(self, futures, task, goal):
+        raise NotImplementedError
+
+
+def test_an_own_cost_says_itself_what_it_asks_of_futures(monkeypatch):
+    """Settings of planning know no cost by its name."""
+    if "own_cost" not in catalog().plugins:
+        catalog().add_plugin(plugin_of(costs={"mine": f"{__name__}:Mine"}), "own_cost")
+    settings = settings_of(["cost=mine", "past=1", "state_past=2"])
+    for carried, observes, past, rows in ((True, False, 2, []), (False, True, None, ["codec"])):
+        monkeypatch.setattr(Mine, "carried", carried)
+        monkeypatch.setattr(Mine, "observes", observes)
+        assert settings.rollouts(make_cost(settings))["state_past"] == past
+        assert settings.rows(["codec"]) == rows
 
 
 @pytest.mark.parametrize("past", [0, 1, 2])

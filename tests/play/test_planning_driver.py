@@ -52,10 +52,9 @@ def history():
 def test_it_decides_as_acwm_plan_does(bundle, driver, history):
     seen, goal, still = history
     settings = settings_of([], declared=FEW)
-    rollouts = ModelRollouts(bundle.world_model, bundle.card, None, **settings.rollouts())
-    planned = PlanningController(
-        make_planner(settings), rollouts, make_cost(settings), action_std=[0.5, 0.5]
-    )
+    cost = make_cost(settings)
+    rollouts = ModelRollouts(bundle.world_model, bundle.card, None, **settings.rollouts(cost))
+    planned = PlanningController(make_planner(settings), rollouts, cost, action_std=[0.5, 0.5])
     planned.aim(Quick(), goal, bundle.card.action, still, 7)
     driver.begin(goal, still, 7)
     checks = []

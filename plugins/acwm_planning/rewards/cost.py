@@ -35,6 +35,8 @@ class RewardCost(StateDistance):
         DataError: there is no head.
     """
 
+    judged = False
+
     def __init__(
         self,
         *,
@@ -49,9 +51,12 @@ class RewardCost(StateDistance):
             self._task = RewardTask(self.head, 1)
             self._task.tolerance = self.head.card.std  # the unit of the cost
 
-    def about(self, card: EnvironmentCard) -> Mapping[str, str]:
-        """The head's file and its error."""
+    def check(self, card: EnvironmentCard) -> None:
+        """Refuse another environment than the head's."""
         self.head.check(card)
+
+    def about(self) -> Mapping[str, str]:
+        """The head's file and its error."""
         return {"head": self._digest[:12], "head_error": self.head.card.held_out.text}
 
     def __call__(self, futures: Futures, task: Task, goal: Goal) -> Tensor:
