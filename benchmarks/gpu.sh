@@ -34,7 +34,9 @@ part() {
 part tests "$python" -m pytest -q -n 0 -m gpu tests/training
 part memory "$python" benchmarks/memory.py --clips 1 --clips 4
 part training "$python" benchmarks/training.py --size small --size dit_s
+part large "$python" benchmarks/training.py --size dit_m --size dit_l --size dit_xl --precision bfloat16 --no-compile --repetitions 4
 part loading "$python" benchmarks/loading.py --size 64 --seconds 5
 part rollout "$python" benchmarks/rollout.py --device cuda --size 240 --steps 4,50 --model dit_xs --model dit_s
+part serve "$python" benchmarks/serve.py push_cube --clients 64 --minutes 1
 echo "results are in $folder"
 exit $failed

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -22,15 +23,10 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.nn import functional
 from training import peak_memory
-from training_networks import SIZES, Ours, Size
+from training_networks import PUBLISHED, SIZES, Ours, Size
 
 import acwm_dit.blocks
 from acwm_core.training.layers import recompute_activations, state_memory, trained_layers
-from acwm_dit.plugin import SIZES as NETWORKS
-
-FRAMES, SIDE = 10, 15
-"""Latent frames and patches per side of a clip in the published setting: 37 frames of 240×240."""
-
 
 WITHOUT_MEMORY = FakeTensorMode()
 """One for all networks, as they share cached tables."""
@@ -88,12 +84,6 @@ def state(size: Size, devices: int) -> int:
         return sum(state_memory(cast(Any, Ours(size)), devices).values())
 
 
-def published(name: str, clips: int) -> Size:
-    """A size of the published setting."""
-    width, layers, heads = NETWORKS[name][:3]
-    return Size(width, layers, heads, clips, FRAMES, SIDE)
-
-
 def estimates(names: list[str], clips: list[int]) -> Table:
     """GB per device: state by number of devices, activations by clips per device."""
     table = Table("size", *(f"state / {n}" for n in (1, 8)), title="GB per device, bfloat16")
@@ -102,9 +92,9 @@ def estimates(names: list[str], clips: list[int]) -> Table:
         table.add_column("recomputed")
     acwm_dit.blocks.attend = attend_as_gpus_do
     for name in names:
-        cells = [f"{state(published(name, 1), devices) / 1e9:.1f}" for devices in (1, 8)]
+        cells = [f"{state(PUBLISHED[name], devices) / 1e9:.1f}" for devices in (1, 8)]
         for each in clips:
-            size = published(name, each)
+            size = replace(PUBLISHED[name], clips=each)
             for recomputed in (False, True):
                 cells.append(f"{activations(size, 'bfloat16', recomputed=recomputed) / 1e9:.1f}")
         table.add_row(name, *cells)
@@ -116,24 +106,23 @@ def checks() -> Table:
     table = Table("size", "precision", "counted", "measured", title="MB on this CPU")
     for name, size in SIZES.items():
         for precision in ("float32", "bfloat16"):
-            if name != "dit_s":
-                with torch.device("meta"):
-                    held = state_memory(cast(Any, Ours(size)))
-                counted = sum(held.values()) - held["average"]
-                counted += activations(size, precision, recomputed=False)
-                measured = peak_memory("acwm", size, precision, torch.device("cpu"))
-                table.add_row(name, precision, *(f"{n / 1e6:,.0f}" for n in (counted, measured)))
+            with torch.device("meta"):
+                held = state_memory(cast(Any, Ours(size)))
+            counted = sum(held.values()) - held["average"]
+            counted += activations(size, precision, recomputed=False)
+            measured = peak_memory("acwm", size, precision, torch.device("cpu"))
+            table.add_row(name, precision, *(f"{n / 1e6:,.0f}" for n in (counted, measured)))
     return table
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--size", action="append", choices=NETWORKS, help="all published sizes")
+    parser.add_argument("--size", action="append", choices=PUBLISHED, help="all published sizes")
     parser.add_argument("--clips", type=int, action="append", help="per device; 1 and 4")
     parser.add_argument("--check", action="store_true", help="compare with what this CPU takes")
     arguments = parser.parse_args()
-    names = arguments.size or [name for name in NETWORKS if name != "dit_xs"]
+    names = arguments.size or [*PUBLISHED]
     table = checks() if arguments.check else estimates(names, arguments.clips or [1, 4])
     Console(width=110).print(table)
 

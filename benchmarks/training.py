@@ -33,12 +33,12 @@ from torch import nn
 from torch._inductor.exc import InductorError
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
-from training_networks import NETWORKS, SIZES, Inputs, Size, build
+from training_networks import NETWORKS, PUBLISHED, SIZES, Inputs, Size, build
 
 from acwm_dit.linear import Linear
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-SMALL_DEVICE = [name for name in SIZES if name != "dit_s"]
+ALL_SIZES = {**SIZES, **PUBLISHED}
 OURS = "acwm"
 
 
@@ -212,7 +212,7 @@ def rows(
     quick: bool,
 ) -> list[list[str]]:
     """The table lines for a size in one precision."""
-    size = SIZES[name]
+    size = ALL_SIZES[name]
     ways, products = measure(size, precision, device, repetitions, compiled=compiled)
     ours = next(way for way in ways if way.name == OURS and way.compiled == compiled)
     lines: list[list[str]] = []
@@ -233,7 +233,7 @@ def rows(
 
 def table_of(name: str, device: torch.device, threads: int) -> Table:
     """An empty table whose title says what was computed and where."""
-    size = SIZES[name]
+    size = ALL_SIZES[name]
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} threads"
     title = (
         f"{name}: width {size.width}, {size.layers} layers, {size.clips} × {size.frames} × "
@@ -249,7 +249,9 @@ def table_of(name: str, device: torch.device, threads: int) -> Table:
 def main() -> None:
     """Measure and print a table per size."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--size", action="append", choices=SIZES, help="all that fit the device")
+    parser.add_argument(
+        "--size", action="append", choices=ALL_SIZES, help="all that fit the device"
+    )
     parser.add_argument("--precision", action="append", choices=PRECISIONS, help="both")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--repetitions", type=int, default=12)
@@ -268,7 +270,7 @@ def main() -> None:
     compiled = on_gpu if arguments.compile is None else arguments.compile
     options = {"compiled": compiled, "quick": arguments.quick}
     repetitions = 2 if arguments.quick else arguments.repetitions
-    for name in arguments.size or (list(SIZES) if on_gpu else SMALL_DEVICE):
+    for name in arguments.size or (ALL_SIZES if on_gpu else SIZES):
         table = table_of(name, device, torch.get_num_threads())
         for precision in arguments.precision or PRECISIONS:
             for row in rows(name, precision, device, repetitions, **options):

@@ -9,6 +9,7 @@ from published_dit import PublishedDiT
 from torch import Tensor, nn
 
 from acwm_core.plugins import catalog
+from acwm_dit.plugin import SIZES as DIT_SIZES
 
 CHANNELS, ACTION_SIZE, STRIDE, PATCH = 16, 2, 4, 2
 
@@ -49,9 +50,15 @@ SIZES = {
     "192x4": Size(width=192, layers=4, heads=3, clips=1, frames=10, side=8),
     "384x6": Size(width=384, layers=6, heads=6, clips=1, frames=10, side=8),
     "768x2": Size(width=768, layers=2, heads=12, clips=1, frames=10, side=15),
-    "dit_s": Size(width=768, layers=10, heads=12, clips=4, frames=10, side=15),
 }
-"""`small` is the network of the small recipes, `dit_s` the published setting."""
+"""Sizes that a CPU trains; `small` is the network of the small recipes."""
+
+PUBLISHED = {
+    name: Size(width, layers, heads, clips=4, frames=10, side=15)
+    for name, (width, layers, heads, _) in DIT_SIZES.items()
+    if name != "dit_xs"
+}
+"""The published networks and setting: 37 frames of 240×240."""
 
 
 class Ours(nn.Module):
