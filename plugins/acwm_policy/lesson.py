@@ -210,8 +210,9 @@ def prepare(
         raise RecipeError(f"{type(world.model).__name__} learns no states, so none can be observed")
     first, _ = scenes.begin([0], [0])
     needs = needs_of(task, {name: first[name] for name in shapes}, goals[0])
+    chosen = measured.inputs.state if measured else chosen_fields(world, card, needs.state, observe)
+    scenes.only({*chosen, *needs.state})
     if measured is None:
-        chosen = chosen_fields(world, card, needs.state, observe)
         state = {name: shapes[name] for name in chosen}
         aims = {name: [*np.shape(goals[0].state[name])] for name in needs.goal}
         inputs = measure(scenes, card, task, state, aims, goals, seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,9 @@ class Scenes(ABC):
         states = self.step(actions.detach().numpy())
         return {name: torch.as_tensor(values) for name, values in states.items()}
 
+    def only(self, fields: Collection[str]) -> None:  # noqa: B027 (most know all alike)
+        """Go on for who needs these fields alone: the others may become NaN."""
+
     def detach(self) -> None:  # noqa: B027 (most have no gradients)
         """Forget the gradients of the steps so far."""
 
@@ -110,6 +113,9 @@ class DreamScenes(Scenes):
         with noting("while the model moves the scenes", *self._world.children()):
             states = self._scenes.step(rows)
         return {name: values.cpu() for name, values in states.items()}
+
+    def only(self, fields: Collection[str]) -> None:
+        self._read, self._scenes = self._read.only(fields), self._scenes.only(fields)
 
     @torch.no_grad()
     def detach(self) -> None:

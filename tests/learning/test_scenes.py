@@ -5,16 +5,18 @@ import pytest
 import torch
 
 from acwm_core.data.simulate import make_environment
-from acwm_core.env.task import TaskEnvironment
+from acwm_core.env.task import Goal, TaskEnvironment
 from acwm_core.errors import RecipeError
 from acwm_core.training.run import load_run
+from acwm_dream.starts import DreamStart
 from acwm_planning.policies.saved import PolicyInputs
 from acwm_policy.episodes import Episodes
 from acwm_policy.lesson import begin_episodes, find_task, prepare
 from acwm_policy.scenes import DreamScenes, SimulatorScenes
+from acwm_scene.node_motion import NodeMotion
 from tests import tiny
 from tests.scene.dots import world_of
-from tests.scene.mechanics import model_of_arms
+from tests.scene.mechanics import NODES, model_of_arms, model_of_ropes
 
 INPUTS = PolicyInputs({"position": [2]}, {"position": [2]}, [0.0] * 4, [1.0] * 4, [1.0] * 2)
 
@@ -92,6 +94,31 @@ def test_dreamt_scenes_are_the_simulated_ones(bundle, begun):
         passed = dream.step(actions)["position"]
         assert passed.shape == (3, 4, 2)
         assert np.abs(passed - simulated.step(actions)["position"]).max() <= 0.51
+
+
+def test_a_dream_moves_no_more_than_is_asked_for(monkeypatch):
+    """Such as a gripper without the cloth that it holds; scenes may still begin anew."""
+    torch.manual_seed(0)
+    model = model_of_ropes(temporal_stride=4, latent_channels=768).eval()
+    world = world_of(model, 4, states=2 + 2 * NODES).eval()
+    monkeypatch.setattr(world, "state_shapes", {"agent": (2,), "nodes": (2 * NODES,)})
+    frames = np.random.default_rng(0).integers(0, 255, (3, 1, 32, 32, 3), np.uint8)
+    goal = Goal({}, np.zeros((32, 32), np.uint8), frames[0, 0])
+    starts = [DreamStart(each, np.zeros((0, 2), np.float32), goal) for each in frames]
+    whole, agents = (DreamScenes(world, starts, 2) for _ in range(2))
+    agents.only(["agent"])
+    moves = rows(3, 2) / 2
+
+    def passed(scenes):
+        scenes.begin([0, 1], [0, 1])
+        first = scenes.step(moves[0])
+        scenes.begin([1], [2])
+        return [first, *map(scenes.step, moves[1:])]
+
+    expected = passed(whole)
+    monkeypatch.setattr(NodeMotion, "forward", lambda *_: pytest.fail("nodes are moved"))
+    for step, wanted in zip(passed(agents), expected, strict=True):
+        np.testing.assert_allclose(step["agent"], wanted["agent"], atol=1e-5)
 
 
 @pytest.mark.parametrize("task", [tiny.PLACE, tiny.SHY], ids=["place", "shy"])
