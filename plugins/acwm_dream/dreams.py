@@ -12,17 +12,22 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.data.pictures import to_pixels
 from acwm_core.env.episode import Split
-from acwm_core.env.physics import Observation, StateEstimator
+from acwm_core.env.physics import Observation
+from acwm_core.env.state_field import StateField
 from acwm_core.env.task import Goal, Task, judged
 from acwm_core.errors import AcwmWarning, DataError, RecipeError, noting, suggest
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.evaluation.evaluate import choose_device
 from acwm_core.evaluation.score import estimator_for
+from acwm_core.model.dynamics import Predictor
+from acwm_core.model.state_stream import StateStream
 from acwm_core.model.stream import Stream
+from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.run import load_run
 from acwm_dream.starts import (
@@ -33,8 +38,12 @@ from acwm_dream.starts import (
     check_options,
     picture_start,
 )
+from acwm_planning.predicted import observation_of
+from acwm_planning.rewards.task import RewardTask
 
 Frames, Actions = NDArray[np.uint8], NDArray[np.float32]
+States = Mapping[str, NDArray[Any]]
+"""Fields of the state, by name."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,7 @@ class DreamSettings:
     Attributes:
         run: run folder, or name of a trained model.
         task: task of its environment; without one, rewards are 0 and no episode ends early.
+        reward: folder of a reward head of `acwm train-reward`, in place of a task.
         start: source of starts: the ``simulator`` or a ``dataset``; if there is no simulator, the
             dataset, with an `AcwmWarning`.
         data: folder of the dataset; that of the run's recipe by default.
@@ -55,6 +65,7 @@ class DreamSettings:
 
     run: str | Path
     task: str | None = None
+    reward: str | Path | None = None
     start: Literal["simulator", "dataset"] = "simulator"
     data: str | Path | None = None
     split: Split = "train"
@@ -65,6 +76,8 @@ class DreamSettings:
     def __post_init__(self) -> None:
         if self.start not in ("simulator", "dataset"):
             raise RecipeError(f"start={self.start!r}: give 'simulator' or 'dataset'")
+        if self.task is not None and self.reward is not None:
+            raise RecipeError("give task= or reward=, not both")
         for name in ("max_steps", "steps"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < 1):
@@ -100,6 +113,7 @@ class _Group:
     """Episodes that started together, in one stream; an episode that restarts leaves its slot."""
 
     stream: Stream
+    carried: StateStream | None  # the same scenes in states, if a reward is of these
     members: list[int | None] = field(default_factory=list[int | None])
 
 
@@ -107,11 +121,11 @@ class StepResult(NamedTuple):
     """What n episodes show after a step, or at the start."""
 
     frames: Frames  # `[n, H, W, 3]`
-    rewards: NDArray[np.float64]  # minus the sum of the distances in the step's frames
+    rewards: NDArray[np.float64]  # of the step's frames: minus their distances, or learnt rewards
     success: NDArray[np.bool_]
     failed: NDArray[np.bool_]
     distance: NDArray[np.float64]
-    states: Mapping[str, NDArray[Any]]  # fields that the estimator reads, `[n, …]`
+    states: Mapping[str, NDArray[Any]]  # fields that are read or predicted, `[n, …]`
 
 
 class Dreams:
@@ -132,8 +146,8 @@ class Dreams:
     Raises:
         TrainingError: there is no such run.
         RecipeError: the model cannot be streamed, or there is no simulator to start from.
-        RecipeError: there is no such task.
-        DataError: no estimator can judge the task, or there is no dataset.
+        RecipeError: there is no such task, or the reward is of another environment or of latents.
+        DataError: no estimator can judge the task, or there is no dataset, or no reward.
     """
 
     def __init__(self, settings: DreamSettings, number: int) -> None:
@@ -141,16 +155,15 @@ class Dreams:
         self.card, self._settings = bundle.card, settings
         self._world = bundle.world_model.to(choose_device(settings.device))
         self._given, self.repeat = self._world.context_frames, self._world.codec.temporal_stride
-        self.task: Task | None = None
-        self._estimator: StateEstimator | None = estimator_for(self.card)
-        if settings.task is not None:
-            component = catalog().component("environment", self.card.name)
-            self.task = component.load_task(settings.task)
-            if self._estimator is None:
-                raise DataError(
-                    f"no estimator reads the states of {self.card.name} from pictures, so its "
-                    "tasks cannot be judged: leave task= out"
-                )
+        self.task, self._estimator = self._find_task(), estimator_for(self.card)
+        head = self.task.head.card if isinstance(self.task, RewardTask) else None
+        self._best = 0.0 if head is None else head.best
+        self._carries = head is not None and _carries(self._world, head.state)
+        if self.task is not None and self._estimator is None and not self._carries:
+            raise DataError(
+                f"no estimator reads the states of {self.card.name} from pictures, so its tasks "
+                "and rewards cannot be judged: leave task= and reward= out"
+            )
         frames = self.task.max_steps if self.task else self.card.horizon - 1
         self.max_steps = -(-(settings.max_steps or frames) // self.repeat)
         self._states = [_EpisodeState() for _ in range(number)]
@@ -161,6 +174,14 @@ class Dreams:
         except RecipeError as error:
             raise RecipeError(f"this model cannot be used as an environment: {error}") from error
         self.starts = self._make_starts(bundle.recipe.data.get("path"))
+
+    def _find_task(self) -> Task | None:
+        settings = self._settings
+        if settings.reward is not None:
+            return RewardTask.read(settings.reward, self.card)
+        if settings.task is None:
+            return None
+        return catalog().component("environment", self.card.name).load_task(settings.task)
 
     def _make_starts(self, path: str | None) -> Starts:
         if self._settings.start == "simulator":
@@ -189,6 +210,9 @@ class Dreams:
             own_options = {name: options[name] for name in self.starts.options if name in options}
             start = self.starts.draw(rng, own_options)
             start = start._replace(goal=goal or start.goal)
+        if isinstance(self.task, RewardTask) and start.goal is None:
+            nothing = Goal({}, np.zeros(self._shape[:2], np.uint8), start.frames[-1])
+            start = start._replace(goal=nothing)
         if self.task is not None and not isinstance(start.goal, Goal):
             raise RecipeError("the task needs a goal: give one in options, a Goal or its picture")
         return start
@@ -207,11 +231,15 @@ class Dreams:
         for group in self._groups:
             group.members = [None if member in which else member for member in group.members]
         self._groups = [group for group in self._groups if {*group.members} != {None}]
-        stream = self._open(starts, seeds)
-        self._groups.append(_Group(stream, [*which]))
+        stream, carried = self._open(starts, seeds)
+        self._groups.append(_Group(stream, carried, [*which]))
         for place, start in zip(which, starts, strict=True):
             self._states[place] = _EpisodeState(start.goal)
-        return self._judge_frames(which, to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None])
+        known = None
+        if carried is not None:
+            known = {name: values[:, None] for name, values in _as_arrays(carried.current).items()}
+        frames = to_pixels(stream.given[:, -1:].flatten(0, 1))[:, None]
+        return self._judge_frames(which, frames, known)
 
     def step(self, which: Sequence[int], actions: NDArray[np.float32]) -> StepResult:
         """Advance some episodes, given in ascending order, with raw actions `[n, A]`.
@@ -221,6 +249,7 @@ class Dreams:
         """
         by_episode = dict(zip(which, actions, strict=True))
         frames: dict[int, Frames] = {}
+        states: dict[int, States] = {}
         for group in self._groups:
             if not by_episode.keys() & {*group.members}:
                 continue
@@ -229,40 +258,69 @@ class Dreams:
             rows = np.stack([by_episode.get(-1 if m is None else m, spare) for m in group.members])
             inputs = torch.from_numpy(rows)[:, None].expand(-1, self.repeat, -1)
             with noting("while the model predicts", *self._world.children()):
-                video = group.stream.step(inputs.to(self._world.action_low.device))
+                inputs = inputs.to(self._world.action_low.device)
+                video = group.stream.step(inputs)
+                known = {} if group.carried is None else _as_arrays(group.carried.step(inputs))
             pixels = to_pixels(video.flatten(0, 1)).reshape(*video.shape[:2], *self._shape)
-            frames |= {m: pixels[k] for k, m in enumerate(group.members) if m in by_episode}
-        return self._judge_frames(which, np.stack([frames[place] for place in which]))
+            for row, member in enumerate(group.members):
+                if member in by_episode:
+                    frames[member] = pixels[row]
+                    states[member] = {name: values[row] for name, values in known.items()}
+        each = [states[place] for place in which]
+        carried = {name: np.stack([one[name] for one in each]) for name in each[0]} or None
+        return self._judge_frames(which, np.stack([frames[place] for place in which]), carried)
 
     @property
     def _shape(self) -> tuple[int, int, int]:
         return (*self.card.frame_size, 3)
 
-    def _open(self, starts: Sequence[DreamStart], seeds: Sequence[int]) -> Stream:
+    def _open(
+        self, starts: Sequence[DreamStart], seeds: Sequence[int]
+    ) -> tuple[Stream, StateStream | None]:
         device = self._world.action_low.device
         video = torch.stack([as_clip(start.frames) for start in starts]).to(device)
         between = torch.from_numpy(np.stack([start.actions for start in starts])).to(device)
         with noting("when the model begins", *self._world.children()):
-            return self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
+            stream = self._world.stream(video, between, steps=self._settings.steps, seeds=seeds)
+            carried = None
+            if self._carries:
+                carried = self._world.stream_states(video, between, seeds=seeds)
+            return stream, carried
 
-    def _judge_frames(self, which: Sequence[int], frames: Frames) -> StepResult:
-        """Judge frames `[n, T, H, W, 3]` by the task; a reward sums distances up to success."""
+    def _judge_frames(
+        self, which: Sequence[int], frames: Frames, carried: States | None = None
+    ) -> StepResult:
+        """Judge frames `[n, T, H, W, 3]` by the task; a reward sums distances up to success.
+
+        What the model says of their states, `[n, T, …]`, takes the place of what is read in them.
+        """
         number, length = frames.shape[:2]
-        rewards, distance = np.zeros(number), np.zeros(number)
-        success, states = np.zeros(number, np.bool_), dict[str, NDArray[Any]]()
-        if self._estimator is not None:
+        rewards, distance, success = np.zeros(number), np.zeros(number), np.zeros(number, np.bool_)
+        states, masks = carried or {}, None
+        if carried is None and self._estimator is not None:
             seen = self._estimator.read(as_clip(frames.reshape(-1, *self._shape)))
             states = {n: v.reshape(number, length, *v.shape[1:]) for n, v in seen.states.items()}
             masks = seen.masks.reshape(number, length, *seen.masks.shape[1:])
-            for row, state in enumerate(self._states[k] for k in which):
-                if self.task is None or state.goal is None:
-                    continue
-                own = Observation(masks[row], {n: v[row] for n, v in states.items()})
-                success[row], rewards[row] = _judge_episode(self.task, own, state)
-                distance[row] = state.distance
+        for row, state in enumerate(self._states[k] for k in which):
+            if self.task is None or state.goal is None:
+                continue
+            own = {n: v[row] for n, v in states.items()}
+            shown = observation_of(own, length) if masks is None else Observation(masks[row], own)
+            success[row], rewards[row] = _judge_episode(self.task, shown, state, self._best)
+            distance[row] = state.distance
         failed = np.array([self._states[k].failed for k in which])
         last = {name: values[:, -1] for name, values in states.items()}
         return StepResult(frames[:, -1], rewards, success, failed, distance, last)
+
+
+def _carries(world: WorldModel, fields: Sequence[StateField]) -> bool:
+    """Whether a model carries all these fields of the state from frame to frame."""
+    able = isinstance(world.model, Predictor) and world.model.implements("carry_states")
+    return able and {field.name for field in fields} <= {*world.state_shapes}
+
+
+def _as_arrays(fields: Mapping[str, Tensor]) -> States:
+    return {name: values.cpu().numpy() for name, values in fields.items()}
 
 
 def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[Actions]]:
@@ -275,15 +333,17 @@ def spaces_of(dreams: Dreams) -> tuple[gymnasium.Space[Frames], gymnasium.Space[
     )
 
 
-def _judge_episode(task: Task, seen: Observation, state: _EpisodeState) -> tuple[bool, float]:
-    """Whether a step succeeds, and minus the sum of its distances up to then."""
+def _judge_episode(
+    task: Task, seen: Observation, state: _EpisodeState, best: float
+) -> tuple[bool, float]:
+    """Whether a step succeeds, and the sum up to then of by how much distances are below `best`."""
     assert state.goal is not None
     reward, names = 0.0, ("distance", "success", "failed")
     judgements = (judged(task, name, seen, state.goal) for name in names)
     for distance, solved, failed in zip(*judgements, strict=True):
         state.distance = float(distance) if np.isfinite(distance) else state.distance
         state.failed = state.failed or bool(failed)
-        reward -= state.distance
+        reward += best - state.distance
         if solved and not state.failed:
             return True, reward
     return False, reward

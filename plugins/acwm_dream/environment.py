@@ -20,8 +20,10 @@ class Dream(gymnasium.Env[Frames, NDArray[np.float32]]):
     frame: its action, raw and in the units of the card, is held for `repeat` video frames, as with
     `gymnasium.wrappers.RepeatAction`. With a task, an estimator reads the states of each video
     frame: the reward is minus the sum of their distances from the goal, and success ends the
-    episode. `info` has ``distance``, ``success``, ``failed`` and ``state`` (the fields that the
-    estimator reads). The `info` of `reset` also has ``goal``.
+    episode. With a learnt reward, it is the sum of its predictions, at most the highest recorded
+    one each, of the states that the model carries, or that an estimator reads. `info` has
+    ``distance``, ``success``, ``failed`` and ``state`` (these fields). The `info` of `reset` also
+    has ``goal``.
 
     `reset` takes the options of the simulator (``spec``, ``split``, ``factors``), or ``episode``,
     the number of a dataset's episode, or ``frame``, a picture ``[H, W, 3]`` uint8, together with

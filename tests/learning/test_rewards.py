@@ -12,6 +12,7 @@ from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.task import Goal
 from acwm_core.errors import DataError, RecipeError
 from acwm_core.training.run import load_run
+from acwm_dream.environment import Dream
 from acwm_formats.recordings import ImportOptions, import_dataset
 from acwm_formats.timeline import RecordedDataset, Recording
 from acwm_planning.planner import Futures
@@ -273,3 +274,32 @@ def test_the_command_says_what_it_learnt(data, tmp_path, capsys):
     assert ended.value.code == 0
     assert "from position" in said
     assert re.search(r"squared error: .* on 5 held-out episodes \(R² ", said)
+
+
+@pytest.mark.parametrize("carried", [True, False], ids=["carried", "read"])
+def test_a_dream_is_rewarded_by_what_was_learnt(run, head, tmp_path, carried):
+    """Of the states that the model carries, or that an estimator reads: the known reward."""
+    model = run if carried else tiny.make_exact_run(tmp_path / "run")
+    env, best = Dream(run=model, reward=head, device="cpu"), RewardHead.read(head).card.best
+    true, random, compared = tiny.Slide(), np.random.default_rng(0), 0
+    for seed in range(4):
+        env.reset(options={"spec": tiny.spec(seed)})
+        true.reset(options={"spec": tiny.spec(seed)})
+        over = late = False
+        while not (over or late):
+            action = random.uniform(-2, 2, 2).astype(np.float32)
+            _, reward, over, late, info = env.step(action)
+            places = [true.advance(action) or true.observe_state()["position"] for _ in range(4)]
+            known = np.minimum(reward_at(np.stack(places)), best)
+            if not over:  # else the step ends before its last frame
+                assert reward == pytest.approx(known.sum(), abs=4.0)
+                assert info["distance"] == pytest.approx(best - known[-1], abs=1.0)
+                compared += 1
+    assert compared > 3
+
+
+def test_a_dream_takes_one_of_task_and_reward(run, head):
+    with pytest.raises(RecipeError, match="task= or reward=, not both"):
+        Dream(run=run, task="place", reward=head)
+    with pytest.raises(DataError, match="holds no reward head"):
+        Dream(run=run, reward=run)
