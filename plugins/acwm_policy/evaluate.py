@@ -215,6 +215,11 @@ def evaluate_policy(
         DataError: there is no policy, or no model; or `out` holds results of another policy.
     """
     policy, where = SavedPolicy.read(folder), out or folder / EVALUATION
+    if not policy.card.task and "reward" not in policy.card.training:
+        raise RecipeError(
+            f"{folder} was trained without a task, so the simulator cannot judge it; curve.csv in "
+            "it has its error on held-out recordings"
+        )
     use_threads(None, None, choose=True)
     model = run or policy.card.training.get("model", policy.card.environment)
     bundle = load_run(model)
@@ -282,8 +287,6 @@ def task_of(policy: SavedPolicy, card: EnvironmentCard) -> Task:
     """
     about = policy.card.training.get("reward")
     if about is None:
-        if not policy.card.task:
-            raise RecipeError("the policy was trained for no task, so nothing tells if it succeeds")
         return load_task(card.name, policy.card.task)
     task = RewardTask.read(about["head"], card)
     if task.facts()["sha256"] != about["sha256"]:

@@ -247,6 +247,10 @@ def imitate(
     """
     train = EpisodeDataset(Path(folder), "train")
     card = train.card.environment
+    if "." not in name and name != card.name:
+        raise RecipeError(
+            f"{folder} holds recordings of {card.name}: write {card.name} in place of {name}"
+        )
     task = None if name == card.name else find_task(name, card)
     tested = EpisodeDataset(Path(folder), "ind_test") if train.card.splits.get("ind_test") else None
     recordings, inputs = read_recordings(train, tested, task, observe, hold, chunk, picture)

@@ -6,6 +6,7 @@ import copy
 import csv
 import io
 import json
+import math
 import time
 from collections.abc import Mapping
 from contextlib import closing
@@ -225,7 +226,7 @@ def _learn(
     if stored is not None:
         keeper.restore(stored)
     shown = progress_bar(
-        f"{about['algorithm']} at {lesson.task} {PLACES[lesson.place]}",
+        f"{about['algorithm']} at {lesson.task or lesson.card.name} {PLACES[lesson.place]}",
         steps,
         unit="steps",
         done=learner.steps,
@@ -261,13 +262,18 @@ class _Keeper:
         self._rows, self._seconds = [*stored["curve"]], stored["seconds"]
 
     def save(self) -> None:
-        """Write everything; a killed command goes on from here."""
+        """Write everything; a killed command goes on from here.
+
+        Of recordings, the policy of the lowest error on those that are held out is kept.
+        """
         now = time.process_time()
         self._seconds, self._began = self._seconds + now - self._began, now
         score = self._lesson.source.score(self._learner.network())
         values = [score.get(name) for name in COLUMNS[1:-1]]
+        errors = [row[COLUMNS.index("error")] for row in self._rows]
         self._rows.append([self._learner.steps, *values, round(self._seconds, 1)])
-        self._policy().save(self._out)
+        if score.get("error", 0.0) <= min((e for e in errors if e is not None), default=math.inf):
+            self._policy().save(self._out)  # few recordings are soon learnt by heart
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self._rows])
         with written_whole(self._out / CURVE) as partial:

@@ -101,7 +101,10 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
     facts = trained.card.training
     click.echo(f"{where}: {facts['steps']} steps in {facts['cpu_seconds']:.0f} s of processor time")
     if "error" in facts:
-        click.echo(f"held-out actions: {facts['error']:.2f} of the error of the mean action")
+        click.echo(
+            f"lowest error on held-out recordings: {facts['error']:.2f} "
+            "(1: no better than the mean action)"
+        )
     if "reward" in facts:
         click.echo(f"error of the reward: {facts['reward']['held_out']}")
     if trained.card.task or "reward" in facts:

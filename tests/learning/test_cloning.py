@@ -17,6 +17,7 @@ from acwm_planning.futures import ModelRollouts
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.saved import PolicyInputs, SavedPolicy, small_pictures
 from acwm_planning.prior import PolicyPrior
+from acwm_policy.clone import Clone
 from acwm_policy.evaluate import evaluate_policy
 from acwm_policy.lesson import imitate
 from acwm_policy.recordings import Recorded, Recordings
@@ -123,6 +124,42 @@ def test_recordings_need_no_task(data, tmp_path):
     assert np.abs(own.act(np.zeros(0), {"position": np.array([4.0, 4.0])})).max() <= 2
 
 
+def test_a_policy_without_a_task_acts_without_a_goal_and_is_judged_by_its_error(data, tmp_path):
+    cloned(data, tmp_path / "clone", name="slide", steps=256)
+    place = {"position": np.array([4.0, 4.0])}
+    alone, reset = (SavedPolicy.read(tmp_path / "clone") for _ in range(2))
+    reset.reset()
+    assert np.array_equal(alone.predict(place), reset.predict(place))
+    with pytest.raises(RecipeError, match=r"trained without a task.*curve\.csv"):
+        evaluate_policy(tmp_path / "clone", seeds=range(1), device="cpu")
+    cloned(data, tmp_path / "aimed", steps=256)
+    with pytest.raises(RecipeError, match="needs its goal"):
+        SavedPolicy.read(tmp_path / "aimed").reset()
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_the_policy_of_the_lowest_error_is_kept(data, tmp_path, monkeypatch, killed):
+    """Training that goes on after it overfits leaves the policy from before, also if killed."""
+    errors = {256: 0.9, 512: 0.5, 768: 0.8, 1024: 0.7}
+    monkeypatch.setattr(Recordings, "shortest", 256)
+    monkeypatch.setattr(
+        Recordings, "score", lambda self, network: {"error": errors[int(network[-1].steps)]}
+    )
+    learn = Clone.learn
+
+    def learn_and_count(self, steps, report):
+        learn(self, steps, report)
+        self._network[-1].steps = self.steps
+
+    monkeypatch.setattr(Clone, "learn", learn_and_count)
+    for steps in (768, 1024) if killed else (1024,):
+        policy = cloned(data, tmp_path / "clone", name="slide", steps=steps)
+    assert (policy.card.training["steps"], policy.card.training["error"]) == (512, 0.5)
+    brief = cloned(data, tmp_path / "brief", name="slide", steps=512)
+    place = {"position": np.array([4.0, 4.0])}
+    assert np.array_equal(policy.predict(place), brief.predict(place))
+
+
 def test_what_cannot_be_imitated_is_one_sentence(data, tmp_path):
     with pytest.raises(RecipeError, match="imitates recordings: name a dataset with --data"):
         cloned(None, tmp_path / "a")
@@ -130,6 +167,8 @@ def test_what_cannot_be_imitated_is_one_sentence(data, tmp_path):
         cloned(data, tmp_path / "a", place="dream")
     with pytest.raises(RecipeError, match="is a task of reacher, not of slide"):
         cloned(data, tmp_path / "b", name="reacher.reach")
+    with pytest.raises(RecipeError, match="holds recordings of slide: write slide in place of my_"):
+        cloned(data, tmp_path / "b", name="my_robot")
     with pytest.raises(RecipeError, match="observe=spede: it was not recorded"):
         cloned(data, tmp_path / "c", "observe=[spede]")
 

@@ -143,7 +143,8 @@ class SavedPolicy:
         self.card, self._network = card, network.eval()
         self._before: Tensor | None = None
         self._decided = list[Tensor]()
-        self._goal: Tensor | None = None
+        aimless = not card.inputs.goal and not card.inputs.aims
+        self._goal = torch.zeros(1, 0, dtype=torch.float64) if aimless else None
 
     @property
     def observes(self) -> Literal["frame", "state"]:
@@ -155,16 +156,22 @@ class SavedPolicy:
         """The next actions, scaled to [-1, 1], `[N, chunk, A]`, for observations `[N, O]`."""
         return self._network(vectors).unflatten(1, (self.card.chunk, -1))
 
-    def reset(self, goal: Goal) -> None:
-        """Start an episode."""
+    def reset(self, goal: Goal | None = None) -> None:
+        """Start an episode; a policy without a task needs no goal.
+
+        Raises:
+            RecipeError: the policy needs a goal.
+        """
         shapes = self.card.inputs.goal
+        self._before, self._decided = None, []
+        if goal is None and (shapes or self.card.inputs.aims):
+            raise RecipeError("the policy needs its goal: call reset(goal)")
         self._goal = torch.zeros(1, 0, dtype=torch.float64)
-        if self.card.inputs.aims:
+        if goal is not None and self.card.inputs.aims:
             self._goal = self._picture(goal.frame)
-        elif shapes:
+        elif goal is not None and shapes:
             fields = {name: np.asarray(goal.state[name])[None] for name in shapes}
             self._goal = side_by_side(fields, shapes)
-        self._before, self._decided = None, []
 
     def predict(self, seen: Mapping[str, NDArray[Any]] | NDArray[np.uint8]) -> NDArray[np.float32]:
         """The next raw action `[A]`; what is unknown is taken to be as it was.
@@ -176,7 +183,7 @@ class SavedPolicy:
             RecipeError: a field that the policy observes is missing, or no goal was given.
         """
         if self._goal is None:
-            raise RecipeError("a policy needs its goal: call reset(goal) first")
+            raise RecipeError("the policy needs its goal: call reset(goal) first")
         now = self._state(seen) if isinstance(seen, Mapping) else self._picture(seen)
         before = now if self._before is None else self._before
         self._before = now = torch.where(now.isfinite(), now, before)
