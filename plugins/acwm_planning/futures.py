@@ -174,8 +174,9 @@ class ModelFutures(Futures):
         """
         if self._estimator is None:
             raise DataError(
-                "no estimator reads the states of this environment from pictures, which the cost "
-                "needs: take cost=latent"
+                "no estimator reads the states of this environment from pictures, and the model "
+                "predicts too few: take cost=latent, or a reward of latents (`acwm train-reward "
+                "--latents`)"
             )
         return self._estimator.read(self.video(frames).flatten(0, 1).cpu())
 

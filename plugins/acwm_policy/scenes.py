@@ -15,7 +15,7 @@ from acwm_core.data.simulate import make_environment
 from acwm_core.env.environment import EnvironmentCard
 from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal
-from acwm_core.errors import noting
+from acwm_core.errors import RecipeError, noting
 from acwm_core.evaluation.clips import as_clip
 from acwm_core.model.state_stream import StateStream
 from acwm_core.model.world_model import WorldModel
@@ -88,11 +88,16 @@ class DreamScenes(Scenes):
         number: number of scenes.
 
     Raises:
-        RecipeError: the model carries no states.
+        RecipeError: the model predicts or carries no states.
     """
 
     def __init__(self, world: WorldModel, starts: Sequence[DreamStart], number: int) -> None:
         super().__init__(number)
+        if not world.state_shapes:
+            raise RecipeError(
+                "the model predicts no states, so no policy can learn in it: train one that does "
+                "(`acwm fit … +scene`)"
+            )
         self._world = world.requires_grad_(False)
         self.starts, self.repeat = len(starts), world.codec.temporal_stride
         self._goals = [start.goal for start in starts]

@@ -9,6 +9,7 @@ from acwm_planning.policies.ranking import RANKING_FILE, RANKING_FOLDER, Ranking
 from acwm_report.figures import Chart, Curve
 from acwm_report.run import EvaluatedRun, result_files
 from acwm_report.table import PLAIN, Cell, Column, Row, Table
+from acwm_report.titles import counted
 
 JUDGES = {
     "model": ("Model", "an estimator's readings of its predictions"),
@@ -51,11 +52,13 @@ def ranking_table(ranking: Ranking) -> Table:
         if choices is None
         else (
             f"Regret: {_text(choices.regret.value)} {ranking.unit} per action by the model’s "
-            f"choice, {_text(choices.chance.value)} at random, over {choices.starts} starts. "
+            f"choice, {_text(choices.chance.value)} at random, "
+            f"over {counted(choices.starts, 'start')}. "
         )
     )
     caption = f"{lost}{_unread(ranking)}Returns are negative sums of distances in {ranking.unit}."
-    head = f"{ranking.task} · {len(ranking.policies)} policies, {ranking.episodes} episodes of each"
+    policies = f"{len(ranking.policies)} polic{'y' if len(ranking.policies) == 1 else 'ies'}"
+    head = f"{ranking.task} · {policies}, {counted(ranking.episodes, 'episode')} of each"
     return Table(head, columns, rows, "Judged by", caption, f"policies-{ranking.task}")
 
 

@@ -79,6 +79,12 @@ def test_a_model_that_carries_no_states_says_so(tmp_path):
         bundle.world_model.stream_states(torch.zeros(1, 3, 32, 32))
 
 
+def test_no_policy_learns_in_a_model_without_states(tmp_path, begun):
+    bundle = load_run(tiny.make_exact_run(tmp_path / "run"))
+    with pytest.raises(RecipeError, match=r"predicts no states.*\+scene"):
+        DreamScenes(bundle.world_model, begun.starts, 1)
+
+
 def test_dreamt_scenes_are_the_simulated_ones(bundle, begun):
     """The model reads whole pixels and is exact from there on."""
     goals = [start.goal for start in begun.starts]

@@ -89,7 +89,8 @@ class Ranker(EpisodeTable):
         predicted = time.perf_counter() - played
         plays = len(self.policies) + 2 + 1 + len(BRANCHES)  # those of a decision are played again
         seconds = plays * (played - began) + -(-rows // batch) * predicted
-        return f"about {duration(len(missing) * seconds)} for {len(missing)} starts"
+        starts = f"{len(missing)} start{'s' * (len(missing) != 1)}"
+        return f"about {duration(len(missing) * seconds)} for {starts}"
 
     def lines(self, seed: int, rows: Sequence[str]) -> list[Line]:
         start = self._simulator.start(spec_of_seed(self._environment.environment.card, seed))
