@@ -24,7 +24,7 @@ from acwm_core.training.run_folder import RunFolder, find_run
 from acwm_planning.resumable import Line, ResumableResults
 from acwm_policy.collect import Collection, collect
 from acwm_policy.evaluate import DREAM, ROWS, TRAINED, evaluate_policy
-from acwm_policy.lesson import find_task
+from acwm_policy.lesson import Place, find_task
 from acwm_policy.settings import PolicySettings, learner_class
 from acwm_policy.train import train_policy
 
@@ -43,10 +43,10 @@ class Round:
         task: ENVIRONMENT.TASK.
         round: its number; in round 0 nothing has been collected, and the model is the given one.
         frames: number of frames that were simulated for training so far.
-        steps: number of steps that the policy has learnt for so far, in dreams.
+        steps: number of steps that the policy has learnt for so far.
         episodes: number of episodes that were measured, the same ones in every round.
         dream: share of success in the model, with its exact 95 % interval; None if the model does
-            not predict what the policy observes.
+            not predict what the policy observes, or the policy learns in the simulator.
         simulator: the same in the simulator.
         gap: the first minus the second, with its bootstrap interval.
         distance: mean final distance in the simulator.
@@ -81,11 +81,14 @@ class Loop:
     starts: int
     data: Path | None
     seed: int
+    place: Place
 
     def identity(self) -> dict[str, Any]:
         """All that determines the results, to write down."""
         facts = {field.name: getattr(self, field.name) for field in fields(self)}
         del facts["card"], facts["out"]
+        if self.place == "dream":
+            del facts["place"]
         base = self.data and EpisodeDataset(self.data, "train").checksum
         weights = file_sha256(RunFolder(find_run(self.run)).weights)
         settings = asdict(self.settings)
@@ -97,14 +100,15 @@ class Loop:
 
     def play(self, number: int, workers: int | None, device: str, progress: bool) -> Round:
         """One round: data, model, policy, measurement; each goes on where it was interrupted."""
-        here, run, frames = self.folder(number), self.run, 0
-        if number:
+        here, run, frames, dreamt = self.folder(number), self.run, 0, self.place == "dream"
+        if number and dreamt:
             frames = self.collect(number, workers, progress)
             run = str(self.train_model(number))
         policy = train_policy(
             *(run, self.task),
             settings=self.settings,
             out=here / POLICY,
+            place=self.place,
             steps=self.steps * (number + 1),
             scenes=self.scenes,
             starts=self.starts,
@@ -113,15 +117,18 @@ class Loop:
             device=device,
             progress=progress,
         )
+        rows = (TRAINED, DREAM) if number else ROWS
         found = evaluate_policy(
             here / POLICY,
             seeds=self.seeds,
             run=run,
-            rows=(TRAINED, DREAM) if number else ROWS,
+            rows=[row for row in rows if dreamt or row != DREAM],
             device=device,
             progress=progress,
         )
-        return _measured(found, self.task, number, frames, policy.card.training["steps"])
+        steps = policy.card.training["steps"]
+        frames = frames if dreamt else steps * policy.card.repeat
+        return _measured(found, self.task, number, frames, steps)
 
     def collect(self, number: int, workers: int | None, progress: bool) -> int:
         """Let the policies before this round act; how many frames were simulated so far."""
@@ -162,6 +169,7 @@ def improve_policy(
     data: Path | None = None,
     workers: int | None = None,
     seed: int = 0,
+    place: Place = "dream",
     device: str = "auto",
     report: Callable[[Sequence[Line]], object] = lambda lines: None,
     progress: bool = False,
@@ -188,6 +196,8 @@ def improve_policy(
         data: see `Collection.base`.
         workers: processes that simulate; one per core by default.
         seed: of the policy, and of the episodes without `data`.
+        place: "simulator" lets the policy learn there, without data and without another model: what
+            to compare with.
         device: device of the model.
         report: is called with the lines of all rounds after each of them.
         progress: show progress bars.
@@ -197,7 +207,7 @@ def improve_policy(
         RecipeError: the learner learns from recordings, or an option is out of range.
     """
     kind = learner_class(settings.algorithm)
-    if "dream" not in kind.places:
+    if place == "dream" and place not in kind.places:
         raise RecipeError(
             f"{settings.algorithm} does not learn in a dream, and so nothing of a better model: "
             "choose another algorithm (`acwm list learner`)"
@@ -209,6 +219,7 @@ def improve_policy(
         *(str(run), f"{card.name}.{find_task(task, card).name}", card),
         *(settings, tuple(recipe), out),
         *(episodes, noise, steps or kind.usual_steps, tuple(seeds), scenes, starts, data, seed),
+        place,
     )
     results = ResumableResults(
         out, loop.identity(), keys=("task", "round"), kind=Round, file=ROUNDS

@@ -79,3 +79,6 @@ class Learner(ABC):
     @abstractmethod
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on, after `begin`, as the learner did whose `state` this is."""
+
+    def forget(self) -> None:  # noqa: B027 (most keep nothing of what has passed)
+        """Forget what has passed in a dream, as what follows is another model's."""

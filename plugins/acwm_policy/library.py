@@ -139,6 +139,10 @@ class LibraryLearner(Learner):
         np.random.set_state((kind, key.numpy().astype(np.uint32), *rest))
         self.steps = model.num_timesteps
 
+    def forget(self) -> None:
+        if _buffer_of(self._model):
+            self._model.replay_buffer.reset()
+
 
 class SoftActorCritic(LibraryLearner):
     """Soft actor-critic (Haarnoja et al. 2018)."""

@@ -95,7 +95,8 @@ def train_policy(
         data: dataset to take the starts from instead of the simulator, or to imitate.
         reward: folder of a reward head, to maximise in place of a task; `task` is the environment.
         after: folder of a policy to begin with, which the same learner has trained, for example in
-            an earlier model; its steps count.
+            an earlier model; its steps count. Its scale of observations stays, as its network knows
+            no other; what passed in a dream of another model is forgotten.
         seed: of the starts, the network and the exploration.
         device: device of the model.
         progress: show a progress bar.
@@ -135,9 +136,11 @@ def train_policy(
     with _opened(out, about):
         use_threads(None, None, choose=True)
         bundle.world_model.to(choose_device(device))
-        stored = load_checkpoint(out / CHECKPOINT)
+        stored, other = load_checkpoint(out / CHECKPOINT), False
         if stored is None and after is not None:
             stored = load_checkpoint(after / CHECKPOINT)
+            learnt = SavedPolicy.read(after).card.training
+            other = place == "dream" and learnt.get("weights") != about["weights"]
         begun = beginnings(bundle, asked, starts, data, place)
         lesson = prepare(
             *(bundle, asked, begun, place, number),
@@ -147,7 +150,7 @@ def train_policy(
             measured=None if stored is None else measured_in(stored),
         )
         with closing(lesson.source):
-            return _learn(lesson, settings, about, out, steps, stored, progress)
+            return _learn(lesson, settings, about, out, steps, stored, progress, other)
 
 
 def _place_of(settings: PolicySettings, place: Place | None) -> Place:
@@ -219,12 +222,15 @@ def _learn(
     steps: int,
     stored: Mapping[str, Any] | None,
     progress: bool,
+    other: bool = False,
 ) -> SavedPolicy:
     learner = settings.learner()
     learner.begin(lesson, about["seed"])
     keeper = _Keeper(learner, lesson, about, out)
     if stored is not None:
         keeper.restore(stored)
+    if other:
+        learner.forget()
     shown = progress_bar(
         f"{about['algorithm']} at {lesson.task or lesson.card.name} {PLACES[lesson.place]}",
         steps,

@@ -149,8 +149,24 @@ def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **opt
 @click.option(
     "--out", type=OUT_FOLDER, help="The folder; runs/improved/ENVIRONMENT.TASK by default."
 )
+@click.option(
+    "--in",
+    "place",
+    type=click.Choice(["dream", "simulator"]),
+    default="dream",
+    help="Where the policy learns: in the model, or without it in the simulator, to compare with.",
+)
+@click.option(
+    "--beside",
+    type=ExistingFolder(
+        "folder of rounds", "rounds.csv", "`acwm policy improve ENVIRONMENT.TASK --in simulator`"
+    ),
+    help="Other rounds of the task to show on the page, such as those --in simulator.",
+)
 @click.option("--device", default="auto", help="Device of the model while the policy learns.")
-def improve(task: str, words: tuple[str, ...], out: Path | None, **options: Any) -> None:
+def improve(
+    task: str, words: tuple[str, ...], out: Path | None, beside: Path | None, **options: Any
+) -> None:
     """Improve a model and a policy in turn: collect, train both further, and measure.
 
     In each round the policy acts in the simulator, with noise; what it did is added to the data;
@@ -167,19 +183,20 @@ def improve(task: str, words: tuple[str, ...], out: Path | None, **options: Any)
     settings, where = settings_of(own), out or Path("runs/improved") / task
 
     from acwm_policy.improve import improve_policy
-    from acwm_report.policy_page import PAGE_FILE, write_rounds_page
+    from acwm_report.policy_page import PAGE_FILE, rounds_beside, write_rounds_page
 
+    other = None if beside is None else rounds_beside(beside, task, len(options["seeds"]))
     lines = improve_policy(
         model_of(task, words),
         task,
         settings=settings,
         out=where,
         recipe=of_recipe,
-        report=lambda lines: write_rounds_page(where, lines),
+        report=lambda lines: write_rounds_page(where, lines, other),
         progress=True,
         **options,
     )
-    print_page_table(write_rounds_page(where, lines))
+    print_page_table(write_rounds_page(where, lines, other))
     click.echo(where / PAGE_FILE)
 
 

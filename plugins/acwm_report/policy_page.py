@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from acwm_core.errors import DataError
 from acwm_core.evaluation.statistics import Estimate
 from acwm_core.files import typed
 from acwm_planning.policies.saved import SavedPolicy
 from acwm_planning.results import RowSummary
 from acwm_planning.resumable import Line
+from acwm_policy.improve import TABLE as ROUNDS_TABLE
 from acwm_policy.improve import Round
 from acwm_policy.train import CURVE
 from acwm_report.figures import Chart, Curve
@@ -45,7 +47,7 @@ CAPTION = (
 ROUNDS_CAPTION = (
     "Success on the same episodes in every round. Intervals of shares are exact (Clopper and "
     "Pearson), that of the gap is bootstrapped over episodes. Frames are those that were simulated "
-    "for training; in round 0 there are none."
+    "for training; in round 0 there are none, unless the policy learns in the simulator."
 )
 
 
@@ -152,8 +154,33 @@ def _figures(results: Mapping[str, Any]) -> list[tuple[str, str]]:
     return figures
 
 
-def write_rounds_page(folder: Path, lines: Sequence[Line]) -> Table:
+def rounds_beside(folder: Path, task: str, episodes: int) -> Curve:
+    """Success in the rounds of another folder, to show beside those of a task.
+
+    Raises:
+        DataError: it is of another task, or of another number of episodes.
+    """
+    lines = [*csv.DictReader((folder / ROUNDS_TABLE).read_text("utf-8").splitlines())]
+    for line in lines:
+        if (line["task"], int(line["episodes"])) != (task, episodes):
+            raise DataError(
+                f"{folder} has rounds of {line['task']} on {line['episodes']} episodes: --beside "
+                f"takes those of {task} on the same {episodes}"
+            )
+    ends = (
+        [100 * float(line[f"simulator{end}"]) for line in lines] for end in ("", "_low", "_high")
+    )
+    frames = [float(line["frames"]) for line in lines]
+    return Curve(f"in the simulator: {folder.name}", "shuffled", frames, next(ends), "--", *ends)
+
+
+def write_rounds_page(folder: Path, lines: Sequence[Line], beside: Curve | None = None) -> Table:
     """Write the page of `acwm policy improve`: a line for each round, and success against frames.
+
+    Args:
+        folder: of the rounds.
+        lines: of `improve_policy`.
+        beside: another curve to draw; see `rounds_beside`.
 
     Returns:
         The table that it shows.
@@ -167,7 +194,7 @@ def write_rounds_page(folder: Path, lines: Sequence[Line]) -> Table:
         lead="",
         figures=(),
         tables=[table],
-        charts=[rounds_chart(rounds)],
+        charts=[rounds_chart(rounds, [] if beside is None else [beside])],
         charts_title="Over the rounds",
         videos=[],
     )
@@ -201,11 +228,13 @@ def rounds_table(rounds: Sequence[Round]) -> Table:
     return Table(head, columns, rows, "Round", ROUNDS_CAPTION, f"rounds-{rounds[0].task}")
 
 
-def rounds_chart(rounds: Sequence[Round]) -> Chart:
-    """Success against the frames that were simulated for training."""
+def rounds_chart(rounds: Sequence[Round], beside: Sequence[Curve] = ()) -> Chart:
+    """Success against the frames that were simulated for training, beside other curves."""
+    dreams = [each.dream for each in rounds]
     curves = [
-        _success("in the dream", "model", rounds, [each.dream for each in rounds]),
+        *[_success("in the dream", "model", rounds, dreams)] * any(dreams),
         _success("in the simulator", "truth", rounds, [each.simulator for each in rounds]),
+        *beside,
     ]
     labels = "simulated frames", "success (%)"
     return Chart("Success", f"rounds-{rounds[0].task}", curves, *labels, points=True)

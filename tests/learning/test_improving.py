@@ -20,6 +20,7 @@ from acwm_policy import improve as module
 from acwm_policy.collect import Collection, collect
 from acwm_policy.improve import improve_policy
 from acwm_policy.settings import PolicySettings
+from acwm_report.policy_page import rounds_beside
 from tests import tiny
 from tests.learning.world import straight
 
@@ -184,14 +185,43 @@ def test_wrong_words_are_one_sentence(run, tmp_path, capsys, words, said):
     assert said in capsys.readouterr().err
 
 
+def test_a_policy_that_learns_in_the_simulator_is_the_curve_beside(run, tmp_path, capsys):
+    """Its frames are those of its own steps, and rounds of another task are refused."""
+    library = PolicySettings("ppo", parameters={"n_steps": 4, "batch_size": 4})
+    options = {"settings": library, "place": "simulator", "scenes": 1, "steps": 8}
+    lines = improve_policy(
+        *(run, "slide.place"),
+        **{**options, "out": tmp_path / "free", "rounds": 1, "seeds": range(2), "starts": 4},
+    )
+    steps = [line["steps"] for line in lines]
+    assert [line["frames"] for line in lines] == [4 * count for count in steps]
+    assert steps[1] > steps[0] >= 8
+    assert [line["dream"] for line in lines] == [None, None]
+    assert not (tmp_path / "free" / "data").exists()
+    curve = rounds_beside(tmp_path / "free", "slide.place", 2)
+    assert [*curve.x] == [line["frames"] for line in lines]
+    assert [*curve.y] == [100 * line["simulator"]["value"] for line in lines]
+    assert [*curve.high] == [100 * line["simulator"]["high"] for line in lines]
+    words = ["slide.place", str(run), "algorithm=backprop", "--beside", str(tmp_path / "free")]
+    with pytest.raises(SystemExit) as ended:
+        main(["policy", "improve", *words, "--seeds", "0..2", "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    assert "takes those of slide.place on the same 3" in capsys.readouterr().err
+
+
 def test_the_command_writes_a_page_with_every_round(run, tmp_path, capsys):
     few = ["net_arch=[8]", "horizon=2", "--steps", "16", "--scenes", "2", "--starts", "4"]
     words = ["algorithm=backprop", *few, "--rounds", "0", "--seeds", "0..1"]
+    (tmp_path / "free").mkdir()
+    header = "task,round,frames,episodes,simulator,simulator_low,simulator_high"
+    (tmp_path / "free/rounds.csv").write_text(f"{header}\nslide.place,0,96,2,0.5,0.1,0.9\n")
+    words += ["--beside", str(tmp_path / "free")]
     with pytest.raises(SystemExit) as ended:
         main(["policy", "improve", "slide.place", str(run), *words, "--out", str(tmp_path / "out")])
     said = capsys.readouterr()
     assert ended.value.code == 0, said.err
     assert "Round 0" in said.out
     page = (tmp_path / "out" / "index.html").read_text()
+    assert "in the simulator: free" in page
     assert "Rounds of slide.place" in page
     assert "simulated frames" in page

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from acwm_core.cli import main
@@ -20,6 +23,7 @@ from acwm_planning.policies.networks import layers_of, network_of
 from acwm_planning.policies.saved import SavedPolicy, raw_actions
 from acwm_policy.lesson import begin_episodes, prepare
 from acwm_policy.settings import PolicySettings, settings_of
+from acwm_policy.train import load_checkpoint
 from tests import tiny
 from tests.extras import needs
 from tests.learning.world import straight
@@ -100,6 +104,27 @@ def test_a_killed_training_ends_as_one_that_was_not(run, tmp_path, monkeypatch, 
     kept, usual = ([row[:-1] for row in curve] for curve in curves)
     assert kept == usual
     assert len(kept) > 3
+
+
+@needs("stable_baselines3")
+@pytest.mark.parametrize("place", ["dream", "simulator"])
+@pytest.mark.parametrize("other", [True, False], ids=["another model", "the same model"])
+def test_what_passed_in_the_dream_of_another_model_is_not_learnt_from(run, tmp_path, other, place):
+    """The steps of the simulator stay true whatever the model; the scale of observations stays."""
+    model = tmp_path / "model"
+    shutil.copytree(run, model)
+    if other:
+        path = model / "model.safetensors"
+        with safe_open(path, "pt") as file:
+            facts = {**(file.metadata() or {}), "another": "model"}
+        save_file(load_file(path), path, facts)
+    options = {"parameters": FEW["sac"], "place": place}
+    first = train(run, tmp_path / "first", steps=160, **options)
+    second = train(model, tmp_path / "second", steps=320, after=tmp_path / "first", **options)
+    assert second.card.inputs == first.card.inputs
+    kept = load_checkpoint(tmp_path / "second" / "checkpoint.pt")["learner"]["buffer"]
+    forgets = other and place == "dream"
+    assert 8 * len(kept["rewards"]) == second.card.training["steps"] - 160 * forgets
 
 
 KILLED = """
