@@ -144,7 +144,8 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
     aligned = Aligned(recording.name, notes=[*recording.notes])
     try:
         frames = {name: _frame_stream(aligned, name, recording.cameras[name]) for name in cameras}
-        main = frames[cameras[0]]
+        main = _claimed(aligned, frames[cameras[0]], recording.length, options)
+        frames[cameras[0]] = main
         if len(main.times) < 2:
             aligned.add_defect(
                 f"it has {len(main.times)} usable frames, and an action needs the next one", ""
@@ -180,6 +181,17 @@ def _check_span(seconds: float, rate: float) -> None:
 def _frame_stream(aligned: Aligned, name: str, frames: Frames) -> _Samples:
     times = frames.times
     return _sound(aligned, f"camera {name}", _Samples(times, np.arange(len(times))))
+
+
+def _claimed(
+    aligned: Aligned, frames: _Samples, length: int | None, options: Alignment
+) -> _Samples:
+    """The frames without a few beyond those that the source claims: video files often end late."""
+    spare = len(frames.times) - length if length else 0
+    if not 0 < spare <= options.max_gap:
+        return frames
+    aligned.notes.append(f"its last {spare} frames, which have no row, were left out")
+    return _Samples(frames.times[:length], frames.values[:length])
 
 
 def _sound(aligned: Aligned, what: str, stream: _Samples) -> _Samples:

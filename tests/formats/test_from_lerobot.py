@@ -177,6 +177,38 @@ def test_version_2_comes_in_too(tmp_path):
         assert episode.actions[2].tolist() == [number + 0.25, -1.5]
 
 
+def longer(path, episode, frames):
+    """A video that goes on in grey after the last row."""
+    more = np.full((frames, 48, 64, 3), 128, np.uint8)
+    release.video(path, np.concatenate([reference_video(episode), more]))
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_frames_after_the_last_row_are_left_out(tmp_path, frames):
+    root = tmp_path / "old"
+    version_2(root)
+    for number, video in enumerate(sorted(root.glob("videos/*/*/*.mp4"))):
+        longer(video, number, frames)
+    card = load(root, tmp_path / "data", test_episodes=0)
+    assert lengths(tmp_path / "data") == [9, 7, 8]
+    for number, episode in enumerate(episodes_of(tmp_path / "data")):
+        assert psnr(episode.video, reference_video(number)) > 30
+        expected = [(number + 0.25, t - 3.5) for t in range(len(episode.video) - 1)]
+        np.testing.assert_array_equal(episode.actions, [*expected, (0, 0)])
+    (note,) = [note for note in card.source["notes"] if "no row" in note]
+    assert note.startswith(f"3 recordings, e.g. episode 0: its last {frames} frame")
+
+
+def test_many_frames_more_than_rows_are_asked_about(tmp_path):
+    root = tmp_path / "old"
+    version_2(root)
+    longer(root / "videos/chunk-000/observation.images.top/episode_000001.mp4", 1, 5)
+    with pytest.raises(DataError, match=r"episode 1: it claims 7 frames, but has 12"):
+        load(root, tmp_path / "data")
+    load(root, tmp_path / "data", test_episodes=0, on_defect="trim")
+    assert lengths(tmp_path / "data") == [9, 7, 8]
+
+
 def spoil(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
