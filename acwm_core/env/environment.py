@@ -7,6 +7,8 @@ An author writes a card and six small methods (`_start`, `_advance`, `_render`, 
 from __future__ import annotations
 
 import operator
+import os
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -39,6 +41,29 @@ def checked_seed(seed: object) -> int | None:
     if whole < 0:
         raise ShapeError(f"a seed is a whole number of 0 or more, not {seed!r:.60}")
     return whole
+
+
+def check_process(used_in: int | None) -> None:
+    """Refuse to simulate in a process that was forked after a simulator was used.
+
+    Args:
+        used_in: id of the process that first used the simulator; None if none did.
+
+    Raises:
+        AcwmError: that is another process, where the simulator would wait without end.
+    """
+    if used_in not in (None, os.getpid()):
+        raise AcwmError(
+            "a simulator was used before this process was forked and cannot be used here: start "
+            "workers with multiprocessing's 'forkserver' or 'spawn', as in gymnasium.make_vec(…, "
+            "vectorization_mode='async', vector_kwargs={'context': 'forkserver'})"
+        )
+
+
+_OPENGL = ("OpenGL", "glfw", "pyglet", "moderngl")
+"""Libraries by which simulators draw, and which a fork breaks."""
+
+_drawn_in: int | None = None  # the process that first drew an environment by one of `_OPENGL`
 
 
 Policy = Callable[[], NDArray[np.floating[Any]]]
@@ -161,7 +186,9 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
             RecipeError: unknown split or factor, an impossible factor value, no perturbed or no
                 transformed start.
             ShapeError: the seed is no whole number of 0 or more.
+            AcwmError: an environment was drawn by OpenGL before this process was forked.
         """
+        check_process(_drawn_in)
         super().reset(seed=checked_seed(seed))
         options = options or {}
         spec = cast(EpisodeSpec | None, options.get("spec"))
@@ -223,11 +250,19 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The current frame, `[H, W, 3]` uint8."""
-        return self._render()[0]
+        return self._drawn()[0]
+
+    def _drawn(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """What `_render` returns."""
+        global _drawn_in
+        frame, mask = self._render()
+        if _drawn_in is None and any(name in sys.modules for name in _OPENGL):
+            _drawn_in = os.getpid()
+        return frame, mask
 
     def observe(self) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         """The current frame and info, as `reset` and `step` return them."""
-        frame, mask = self._render()
+        frame, mask = self._drawn()
         index = operator.index  # refuses values that are not integers
         contacts = sorted({(index(min(pair)), index(max(pair))) for pair in self._contacts()})
         return frame, {

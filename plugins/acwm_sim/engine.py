@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from acwm_core.env.environment import check_process
 from acwm_core.errors import AcwmError, AcwmWarning
 from acwm_core.files import cache_folder
 from acwm_sim.shell import undisturbed
@@ -121,12 +122,7 @@ def start() -> None:
     global _started_in
     if _started_in == os.getpid():
         return
-    if _started_in is not None:
-        raise AcwmError(
-            "a simulator was used before this process was forked and cannot be used here: start "
-            "workers with multiprocessing's 'forkserver' or 'spawn', as in gymnasium.make_vec(…, "
-            "vectorization_mode='async', vector_kwargs={'context': 'forkserver'})"
-        )
+    check_process(_started_in)
     if threading.current_thread() is not threading.main_thread():
         raise AcwmError(
             "Environments that render must be created in the main thread of a process: "

@@ -1,5 +1,7 @@
 """Factors, specs and the Environment base class, on a point that actions push about."""
 
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -216,3 +218,37 @@ def test_the_unit_of_a_pure_number_is_not_shown():
         unit = "1"
 
     assert Share.unit == ""
+
+
+def said_by_a_fork():
+    """What a process that is forked now says of an environment; empty if it works."""
+    import multiprocessing
+
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe()
+
+    def use():
+        try:
+            Point().reset(seed=0)
+            there.send("")
+        except AcwmError as error:
+            there.send(str(error))
+
+    process = context.Process(target=use)
+    process.start()
+    said = here.recv() if here.poll(60) else "it hangs"
+    process.join(60)
+    return said
+
+
+@pytest.mark.parametrize("library", ["", "OpenGL", "glfw"])
+def test_what_opengl_has_drawn_is_not_used_after_a_fork(monkeypatch, library):
+    monkeypatch.setattr("acwm_core.env.environment._drawn_in", None)
+    monkeypatch.setattr("acwm_core.env.environment._OPENGL", ("no_such_library", library))
+    if library:
+        monkeypatch.setitem(sys.modules, library, sys)
+    assert said_by_a_fork() == ""  # nothing is drawn yet
+    world = Point()
+    world.reset(seed=0)
+    assert ("'context': 'forkserver'" in said_by_a_fork()) == bool(library)
+    world.reset(seed=1)  # here it goes on
