@@ -114,7 +114,11 @@ def trained(steps: int, *words: str) -> Callable[[Place], list[list[str]]]:
     """`acwm fit`, and the predictions of the run."""
 
     def commands(place: Place) -> list[list[str]]:
-        limits = [f"trainer.max_steps={steps}", f"seed={place.seed}", f"data.path={place.data}"]
+        limits = [
+            f"trainer.max_steps={steps}",
+            f"training.seed={place.seed}",
+            f"data.path={place.data}",
+        ]
         fit = ["fit", place.world, "+small", *words, *limits, *SETTINGS, "--out", str(place.run)]
         predict = program("trained", "--run", str(place.run), "--name", place.method, train=False)
         return [[*ACWM, *fit], *predict(place)]
