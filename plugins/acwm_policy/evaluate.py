@@ -274,8 +274,19 @@ def _summary(
         **left.facts(),
         "rows": [asdict(row) for row in summarise(lines, ROWS)],
         "gap": asdict(gap_of(lines)) if any(line["row"] == DREAM for line in lines) else None,
+        "dream_alone": solved_in_dream_alone(lines),
         "training": policy.card.training,
     }
+
+
+def solved_in_dream_alone(lines: Sequence[Line]) -> list[int]:
+    """Seeds of the episodes that the policy solves in the dream and not in the simulator."""
+    won = {(line["row"], line["seed"]): line["success"] for line in lines}
+    return sorted(
+        seed
+        for row, seed in won
+        if row == TRAINED and won.get((DREAM, seed)) and not won[row, seed]
+    )
 
 
 def task_of(policy: SavedPolicy, card: EnvironmentCard) -> Task:

@@ -14,6 +14,7 @@ from acwm_core.training.run import load_run
 from acwm_planning.policies.own import OwnPolicy
 from acwm_planning.policies.run import rank_policies
 from acwm_planning.policies.saved import SavedPolicy
+from acwm_policy.evaluate import solved_in_dream_alone
 from tests import tiny
 from tests.extras import needs
 from tests.learning.world import straight
@@ -57,6 +58,14 @@ def test_the_best_policy_solves_what_can_be_solved(run, policy, capsys):
     page = (policy / "evaluation" / "index.html").read_text()
     assert f"<dd>{len(can)}/8</dd>" in page
     assert page.count("<video") == 3
+
+
+def test_episodes_that_only_the_dream_solves_are_named():
+    won = {("trained", 1): True, ("dream", 1): True, ("trained", 4): False, ("dream", 4): True}
+    won |= {("trained", 2): False, ("dream", 2): False, ("trained", 3): False, ("random", 3): True}
+    won |= {("trained", 0): False, ("dream", 0): True}
+    lines = [{"row": row, "seed": seed, "success": done} for (row, seed), done in won.items()]
+    assert solved_in_dream_alone(lines) == [0, 4]
 
 
 def test_a_video_has_the_dream_of_the_same_policy_beside_the_simulator(run, policy):
