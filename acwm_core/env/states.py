@@ -129,7 +129,7 @@ def transform(field: StateField, values: Array, symmetry: Symmetry, camera: Came
         if part.kind == "value" or (part.kind != "presence" and motion is None):
             raise ShapeError(
                 f"the symmetry {symmetry.name} does not say how it transforms {field.name}, and "
-                f"{'no camera' if motion is None else 'its kind'} tells"
+                f"{'there is no camera' if motion is None else 'its kind does not imply it'}"
             )
         if motion is not None and part.kind != "presence":
             taken = _moved(field, part, taken, motion)

@@ -146,7 +146,9 @@ class Stream:
         keypoints = self.keypoints()
         count = 0 if keypoints is None else keypoints.values.shape[2]
         if not 0 <= number < count:
-            raise RecipeError(f"this model has {count} things to move, so none of number {number}")
+            raise RecipeError(
+                f"this model has {count} things to move, numbered from 0: there is no {number}"
+            )
         if len(place) != 2 or not all(-1 <= part <= 1 for part in place):
             raise RecipeError(f"a place is two numbers from -1 to 1, not {list(place)}")
         with torch.inference_mode():

@@ -58,9 +58,9 @@ from acwm_core.cli.arguments import DATASET, OUT_FILE, RUN
 def train_codec(
     data: tuple[Path, ...], out: Path, codec: str, start: str | None, **options: object
 ) -> None:
-    """Train a codec on the training episodes of DATA, where a folder named twice counts twice.
+    """Train a codec on the training episodes of DATA.
 
-    Starts from the weights that ship and prints the gain on test episodes. If it is interrupted,
+    A folder that is named twice counts twice. Starts from the weights that ship and prints the gain on test episodes. If it is interrupted,
     run the same command again to continue. Use the result in a recipe with codec.weights=FILE.
     """
     from acwm_codecs.train_codec import train_on

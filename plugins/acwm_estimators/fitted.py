@@ -260,5 +260,5 @@ def _angle(name: str, fold: int, points: Sequence[Points], card: EnvironmentCard
     count = int(np.prod(shapes[name]))
     under = next((each for each in points if each.rows == count), None)
     if under is None:
-        raise DataError(f"{name} has {count} angles, and no position that is read as many rows")
+        raise DataError(f"{name} has {count} angles, but no position with as many rows is read")
     return Local(name, under.field, count, "angle", fold=fold, whole=True)

@@ -402,7 +402,7 @@ def _held(
     known = (place >= 0) & ((place < last) | ~due)
     known &= ~lost | (hole <= options.max_gap * grid.step + slack)
     if filled := int(np.sum(lost & known)):
-        aligned.notes.append(f"{filled} missing of {name} were filled with the value before")
+        aligned.notes.append(f"{filled} missing of {name} were filled with the previous value")
     return stream.values[before], known
 
 

@@ -85,7 +85,7 @@ def check(path: Path, replays: int) -> int:
     "--latent",
     type=click.IntRange(1, 8),
     metavar="N",
-    help="Learn latent actions of N whole numbers from the videos alone.",
+    help="Learn latent actions of N integers from the videos alone.",
 )
 @click.option("--out", type=OUT_FOLDER, required=True, help="Data folder to create.")
 @click.option(
@@ -103,13 +103,13 @@ def label_data(
 ) -> None:
     """Read the actions of the episodes of DATA from their videos.
 
-    An inverse dynamics model learns from the episodes of --from what action lies between frames.
-    The new dataset has the recorded episodes and the labelled ones; its card tells which are which,
-    and its state has the confidence of every action. Actions that DATA has are not used.
+    An inverse dynamics model learns from the episodes of --from which action lies between frames.
+    The new dataset has the recorded episodes and the labelled ones; its card lists which are which,
+    and its state has the confidence of every action. Actions in DATA are ignored.
 
     With --latent, where no actions were recorded at all, the new dataset has the episodes of DATA
-    with latent actions: whole numbers from -2 to 2 that tell what happens between two frames. Then
-    --from is optional, and what relates latent to recorded actions is fitted to its episodes.
+    with latent actions: integers from -2 to 2 that describe what happens between two frames. Then
+    --from is optional: a map from latent to recorded actions is fitted to its episodes.
     """
     if latent is not None:
         if least:

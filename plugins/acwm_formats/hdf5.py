@@ -101,7 +101,7 @@ class HDF5(Format):
             video: Path of the frames in an episode's group; several with a comma between.
             actions: Path of the actions in an episode's group.
             states: Paths of the states to keep, with commas between.
-            rate: Frames per second, if the files do not say it.
+            rate: Frames per second, if the files do not state them.
             pixel_range: Values that are black and white, e.g. 0,1 or 0,65535.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
             follow_links: Whether links may lead out of the folder, or of the only file.

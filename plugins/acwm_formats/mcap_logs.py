@@ -91,8 +91,8 @@ class MCAP(Format):
             video: Topics of images or video, with a comma between; all by default.
             actions: Topic of the actions, or TOPIC:FIELD; by default the only one with numbers.
             states: Topics of the states, or TOPIC:FIELD, with a comma between; none by default.
-            stamps: Whose times to take; by default those of headers that are of the log's clock, or
-                that all messages have.
+            stamps: Which times to use; by default those in the headers, if they share the log's
+                clock or all messages have them.
             follow_links: Whether links may lead out of the folder.
         """
         root = Path(root)

@@ -73,7 +73,7 @@ class Minari(Format):
         Args:
             root: the dataset's folder, in which data lies.
             video: Name of the images, if observations are a dict; the first by default.
-            rate: Frames per second; by default those of the environment's spec, if it says them.
+            rate: Frames per second; by default those of the environment's spec, if it has them.
             pixel_range: Values that are black and white, e.g. 0,1.
             channels: What four channels are (rgba), or which of stacked grey frames is the newest.
             follow_links: Whether links may lead out of the folder.

@@ -92,7 +92,7 @@ OPTIONS = (
     ),
     _option(
         ["--max-gap"],
-        "Longest gap of frames or actions that is filled with the value before.",
+        "Longest gap of frames or actions that is filled with the previous value.",
         type=click.IntRange(0),
         default=2,
     ),

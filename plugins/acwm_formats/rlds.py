@@ -64,7 +64,7 @@ class RLDS(Format):
 
         Args:
             root: the folder with features.json, or the one above it.
-            rate: Steps per second, which the format does not say.
+            rate: Steps per second, which the format does not store.
             video: Names of the images, e.g. image,wrist/rgb; by default all.
             actions: Features that are the actions, joined in this order, e.g. action/world_vector;
                 by default all numbers in action.

@@ -64,10 +64,10 @@ class Gymnasium(Format):
             env_id: id of the environment, as for `gymnasium.make`, or a function that makes it.
             episodes: How many: 100, or 100,10 for train and ind_test; a tenth more for ind_test by
                 default.
-            policy: Who acts: random, or module:function of an observation and a random generator.
+            policy: What acts: random, or module:function of an observation and a random generator.
             seed: Seed of the dataset: of every episode's start and policy.
             frames: End episodes after this many frames.
-            envs: How many to step at once, as a vector environment.
+            envs: Number of environments to step at once, as a vector environment.
         """
         asked = {"policy": policy, "seed": seed, "frames": frames}
         dataset = rollouts(Named(env_id, envs), _name(env_id), episodes, policy, seed, frames)

@@ -108,7 +108,7 @@ class ZarrReplay(Format):
 
         Args:
             root: the folder, or a .zarr.zip file.
-            rate: Frames per second, which the format does not say.
+            rate: Frames per second, which the format does not store.
             video: Names of the frames in data, with a comma between; by default all images.
             actions: Name of the actions in data; action by default.
             states: Names of the states to keep; by default all other numbers.

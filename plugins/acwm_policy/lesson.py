@@ -110,7 +110,7 @@ def find_reward(name: str, folder: Path, bundle: RunBundle) -> RewardTask:
         RecipeError: the model is of another environment, or the reward cannot judge its states.
     """
     if name != bundle.card.name:
-        raise RecipeError(f"{name} is not {bundle.card.name}, which the model is of")
+        raise RecipeError(f"the model is of {bundle.card.name}, not of {name}")
     return RewardTask.read(folder, bundle.card)
 
 
@@ -334,8 +334,8 @@ def usual_distance(scenes: Scenes, task: Task, goals: Sequence[Goal]) -> float:
         distances += judged.distance[np.isfinite(judged.distance)].tolist()
     if not distances or not np.mean(distances) > 0:
         raise RecipeError(
-            f"the task {task.name!r} sees no distance at the start in what the model predicts, so "
-            "no policy can be trained in it"
+            f"the model predicts no state from which the task {task.name!r} could compute a "
+            "distance at the start, so no policy can be trained in it"
         )
     return float(np.mean(distances))
 

@@ -92,7 +92,7 @@ class Recordings:
         away = self._tested.actions - learnt.actions.mean(0).float().repeat(chunk)
         self._spread = float(away.square().mean())
         if not self._spread > 0:
-            raise DataError("the recorded actions are all alike, so nothing can be learnt of them")
+            raise DataError("the recorded actions are all alike, so they teach nothing")
         self._error: float | None = None
 
     def draw(self, number: int, random: torch.Generator) -> Decisions:
@@ -280,7 +280,7 @@ def _scaled(
     moved = torch.cat([episode.states[hold:] - episode.states[:-hold] for episode in episodes])
     known = [values[values.isfinite().all(1)] for values in (whole, moved)]
     if min(map(len, known)) < 2:
-        raise DataError("too little is known of the recorded states to observe them")
+        raise DataError("fewer than two frames have recorded states that are finite")
     spreads = [values.std(0, correction=0) for values in known]
     std, change = (torch.where(spread > 1e-9, spread, 1.0).tolist() for spread in spreads)
     return PolicyInputs(dict(state), dict(aims), known[0].mean(0).tolist(), std, change)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option(
     "--goal",
     type=click.Path(path_type=Path),
-    help="Instead of TASK: plan to what this picture shows, without a simulator.",
+    help="Instead of TASK: plan towards what this picture shows, without a simulator.",
 )
 @click.option(
     "--start", type=click.Path(path_type=Path), help="With --goal: a picture to start from."
@@ -79,8 +79,8 @@ def plan(
     cost.frames=1 past=2 (see `acwm list planner`, `acwm list cost`). Writes a line per episode, a
     summary, and videos. If it is interrupted, run the same command again to continue.
 
-    With --goal or --episode, it makes one plan to a picture, writes its actions and what the model
-    imagines of them, and executes nothing: so it works with recordings.
+    With --goal or --episode, it makes one plan towards a picture, writes its actions and a video of
+    the prediction, and executes nothing. This works for recordings too.
     """
     if task is None or "=" in task or goal or episode is not None:
         words = [word for word in (task, *overrides) if word is not None]

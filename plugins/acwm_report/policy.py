@@ -77,14 +77,14 @@ def policy() -> None:
 )
 @click.option("--device", default="auto", help="Device of the model.")
 def train(task: str, words: tuple[str, ...], place: Any, out: Path | None, **options: Any) -> None:
-    """Train a policy at a task by acting in a model of its environment.
+    """Train a policy for a task by acting in a model of its environment.
 
     MODEL is a run folder or a trained model; the trained model of the environment by default. It
-    must predict states. OVERRIDES choose what learns (`acwm list learner`), and set its parameters
-    by name: algorithm=sac learning_rate=1e-3 policy_kwargs.net_arch=[64,64]; and observe=[…]
-    (fields of the state) and bonus=1 (reward for success). algorithm=clone imitates the recordings
-    of --data. ENVIRONMENT alone is enough to imitate, and with a --reward. If it is interrupted,
-    run the same command again to continue; with more --steps it trains on.
+    must predict states. OVERRIDES choose the algorithm (`acwm list learner`) and set its
+    parameters: algorithm=sac learning_rate=1e-3 policy_kwargs.net_arch=[64,64]. observe=[…] chooses
+    fields of the state, and bonus=1 is the reward for success. algorithm=clone imitates the
+    recordings of --data. To imitate, or to maximise a --reward, give ENVIRONMENT without a task. If
+    it is interrupted, run the same command again to continue; with more --steps it trains on.
     """
     from acwm_policy.settings import settings_of
 
@@ -220,9 +220,9 @@ def evaluate(folder: Path, **options: Any) -> None:
 
     All rows begin at the same starts, of the test split: the policy, another one --beside it,
     random actions, no motion, the behaviour policy that collects data, and the script that knows
-    the goal if the task has one; and the policy in the model. How much better it is there
-    is the gap: what it gains from errors of the model. The policy observes the states of the
-    simulator. Writes a page with the table, what was logged in training, and videos. If it is
+    the goal if the task has one; and the policy in the model. The gap is by how much more often it
+    succeeds in the model than in the simulator, because of the model's errors. In the simulator the
+    policy observes true states. Writes a page with the table, learning curves, and videos. If it is
     interrupted, run the same command again to continue.
     """
     from acwm_policy.evaluate import EVALUATION, evaluate_policy

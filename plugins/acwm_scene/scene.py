@@ -530,7 +530,7 @@ class SceneDynamics(Predictor):
     def _check_states(self) -> None:
         """Refuse to tell states that it does not know."""
         if not self.state_size:
-            raise RecipeError("this scene knows only points that it found itself, and no states")
+            raise RecipeError("this scene predicts only points that it found itself, and no states")
         if not all(group.is_prepared for _, group in self._groups()):
             raise RecipeError(
                 "these weights do not hold the scale of their states, as an earlier version made "
@@ -574,7 +574,7 @@ class SceneDynamics(Predictor):
             if group.keypoint_names
         ]
         if not keypoints:
-            raise RecipeError("this scene knows only values, of which it sees no place")
+            raise RecipeError("this scene has only values, which have no place in a picture")
         size = max(part.values.shape[-1] for part in keypoints)
 
         def together(parts: Iterable[Tensor], axis: int) -> Tensor:

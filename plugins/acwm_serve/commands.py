@@ -49,7 +49,7 @@ def serve(
     """Serve the model of RUN over a websocket.
 
     A client sends first frames and then actions, and receives the predicted frames. Requests of
-    several clients are predicted together. /health and /metrics tell how the server is. Ctrl-C
+    several clients are predicted together. /health and /metrics report the server's state. Ctrl-C
     stops it.
     """
     wait_without_spinning()

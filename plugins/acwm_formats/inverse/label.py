@@ -115,7 +115,9 @@ def check_alike(data: EpisodeDataset, labelled: EpisodeDataset) -> None:
             f"import it again with --fps {theirs.fps:g}"
         )
     if labelled.card.source.get("unusable"):
-        raise DataError(f"{labelled.path} has no recorded actions, so nothing can be learnt of it")
+        raise DataError(
+            f"{labelled.path} has no recorded actions, so there is nothing to learn from"
+        )
 
 
 def _card(

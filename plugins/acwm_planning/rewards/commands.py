@@ -18,7 +18,7 @@ from acwm_core.cli.arguments import DATASET, OUT_FOLDER
     "column",
     required=True,
     metavar="COLUMN",
-    help="Recorded column with the reward or the success of each frame, as next.reward.",
+    help="Recorded column with the reward or the success of each frame, such as next.reward.",
 )
 @click.option(
     "--run",
@@ -29,7 +29,7 @@ from acwm_core.cli.arguments import DATASET, OUT_FOLDER
     "--states",
     metavar="NAMES",
     default="",
-    help="States to look at, separated by commas; by default all but how an episode went.",
+    help="States to look at, separated by commas; by default all but outcomes such as success.",
 )
 @click.option("--latents", is_flag=True, help="Look at latents even if the model predicts states.")
 @click.option("--steps", type=click.IntRange(1), default=2000, help="Optimiser steps.")
@@ -40,9 +40,9 @@ from acwm_core.cli.arguments import DATASET, OUT_FOLDER
 def train_reward(data: Path, column: str, states: str, out: Path | None, **options: Any) -> None:
     """Learn a reward from a recorded column, for plans and policies without a task.
 
-    DATA keeps a number for each frame: a state, or a fact of its episodes. A small network learns
-    it from the other states, and its error is measured on the test episodes, or on a part of the
-    others, that it did not learn from.
+    DATA must have a number for each frame: a state, or a fact of its episodes. A small network
+    learns to predict it from the other states. The error is measured on the test episodes, or on
+    others that are held out.
     """
     from acwm_core.data.card import DatasetCard
     from acwm_planning.rewards.training import train_reward as train

@@ -196,7 +196,7 @@ def _inputs_of(
             )
     world = None if run is None else _world_of(run, train)
     if latents and (world is None or states):
-        raise RecipeError("--latents is for the codec of a model: name it by --run, no --states")
+        raise RecipeError("--latents needs a model: name it by --run, and omit --states")
     predicted = [*world.state_shapes] if world is not None else others
     if latents or (world is not None and not (predicted or states)):
         return _Inputs((), world)
