@@ -60,8 +60,9 @@ def train_codec(
 ) -> None:
     """Train a codec on the training episodes of DATA.
 
-    A folder that is named twice counts twice. Starts from the weights that ship and prints the gain on test episodes. If it is interrupted,
-    run the same command again to continue. Use the result in a recipe with codec.weights=FILE.
+    A folder that is named twice counts twice. Starts from the weights that ship and prints the gain
+    on test episodes. If it is interrupted, run the same command again to continue. Use the result
+    in a recipe with codec.weights=FILE.
     """
     from acwm_codecs.train_codec import train_on
 
