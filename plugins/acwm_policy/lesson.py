@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from acwm_core.data.dataset import EpisodeDataset
 from acwm_core.env.environment import EnvironmentCard
-from acwm_core.env.episode import EpisodeSpec, Split
+from acwm_core.env.episode import EpisodeSpec
 from acwm_core.env.task import Goal, SolvedAtStartError, Task
 from acwm_core.errors import AcwmWarning, DataError, RecipeError, suggest
 from acwm_core.evaluation.score import estimator_for
+from acwm_core.executors import progress_bar
 from acwm_core.model.world_model import WorldModel
 from acwm_core.plugins import catalog
 from acwm_core.training.run import RunBundle
@@ -115,22 +116,23 @@ def find_reward(name: str, folder: Path, bundle: RunBundle) -> RewardTask:
 
 
 def begin_episodes(
-    card: EnvironmentCard, given: int, task: Task, count: int, split: Split = "train"
+    card: EnvironmentCard, given: int, task: Task, count: int, progress: bool = False
 ) -> Beginnings:
-    """The starts of the first episodes of a split, as the simulator shows them, with goals.
+    """The starts of the first training episodes, as the simulator shows them, with goals.
 
     Args:
         card: card of the environment, with the frame size.
         given: number of context frames.
         task: draws the goals.
         count: number of starts; episodes that are solved at their start are passed over.
-        split: of the episodes.
+        progress: show a progress bar, as some goals take seconds to simulate.
     """
     beginnings, number = Beginnings([], []), 0
-    with closing(SimulatorStarts(card, given, task)) as simulator:
+    shown = progress_bar(f"starts of {card.name}", count, unit="starts", shown=progress)
+    with closing(SimulatorStarts(card, given, task)) as simulator, shown as report:
         rng = np.random.default_rng(0)  # unused, as the episode is given
         while len(beginnings.starts) < count:
-            spec = EpisodeSpec(card.name, split, number, options={"size": card.frame_size})
+            spec = EpisodeSpec(card.name, "train", number, options={"size": card.frame_size})
             number += 1
             try:
                 beginnings.starts.append(simulator.draw(rng, {"spec": spec}))
@@ -139,6 +141,7 @@ def begin_episodes(
                     raise
                 continue
             beginnings.specs.append(spec)
+            report(1)
     return beginnings
 
 
@@ -151,7 +154,12 @@ def recorded_starts(folder: str | Path, given: int, count: int) -> Beginnings:
 
 
 def beginnings(
-    bundle: RunBundle, task: Task, count: int, data: str | Path | None, place: Place
+    bundle: RunBundle,
+    task: Task,
+    count: int,
+    data: str | Path | None,
+    place: Place,
+    progress: bool = False,
 ) -> Beginnings:
     """The starts of training: the simulator's, or those of a dataset.
 
@@ -163,7 +171,7 @@ def beginnings(
     if data is not None and place == "simulator":
         raise RecipeError("--data is for the dream: the simulator begins with its own episodes")
     if data is None and simulated:
-        return begin_episodes(card, given, task, count)
+        return begin_episodes(card, given, task, count, progress)
     if data is None:
         text = f"{card.name} has no simulator here: episodes begin like those of its data"
         warnings.warn(text, AcwmWarning, stacklevel=2)

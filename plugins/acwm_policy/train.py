@@ -141,7 +141,7 @@ def train_policy(
             stored = load_checkpoint(after / CHECKPOINT)
             learnt = SavedPolicy.read(after).card.training
             other = place == "dream" and learnt.get("weights") != about["weights"]
-        begun = beginnings(bundle, asked, starts, data, place)
+        begun = beginnings(bundle, asked, starts, data, place, progress)
         lesson = prepare(
             *(bundle, asked, begun, place, number),
             observe=settings.observe,

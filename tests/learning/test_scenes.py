@@ -102,6 +102,13 @@ def test_dreamt_scenes_are_the_simulated_ones(bundle, begun):
         assert np.abs(passed - simulated.step(actions)["position"]).max() <= 0.51
 
 
+def test_what_draws_starts_says_how_far_it_is(bundle, monkeypatch, capsys):
+    """Some goals take seconds to simulate."""
+    monkeypatch.setattr("acwm_core.executors.LINE_EVERY_S", 0.0)
+    begin_episodes(bundle.card, 1, tiny.PLACE, 3, progress=True)
+    assert "starts of slide  3/3 starts" in capsys.readouterr().err
+
+
 def test_a_dream_moves_no_more_than_is_asked_for(monkeypatch):
     """Such as a gripper without the cloth that it holds; scenes may still begin anew."""
     torch.manual_seed(0)
