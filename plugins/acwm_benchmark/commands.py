@@ -83,6 +83,11 @@ def export(words: tuple[str, ...], out: Path, **others: Any) -> None:
 )
 @click.option("--out", type=OUT_FOLDER, help="Folder; scores/NAME of PREDICTIONS by default.")
 @click.option("--overwrite", is_flag=True, help="Replace results of other tasks or settings.")
+@click.option(
+    "--follow-links",
+    is_flag=True,
+    help="Let predictions be links that lead out of PREDICTIONS; for one's own, not for others'.",
+)
 @click.option("--workers", type=int, help="Parallel workers; one per core by default, 0 for none.")
 def score(predictions: Path, worlds: tuple[str, ...], tasks: Path, **others: Any) -> None:
     """Score PREDICTIONS of tasks by any program.

@@ -18,7 +18,7 @@ from acwm_benchmark.tasks import BenchmarkTask, BenchmarkWorld
 from acwm_benchmark.videos import CONTAINERS, NPZ, Coding, coding_of, pictures_in, read_whole
 from acwm_core.data.shards import file_sha256
 from acwm_core.errors import DataError, suggest
-from acwm_core.files import inside, regular_file
+from acwm_core.files import check_regular, inside, regular_file
 
 TOLD = 5
 """How many faults are told in one error."""
@@ -93,14 +93,25 @@ class Predictions:
 
 
 def find_predictions(
-    folder: Path, world: BenchmarkWorld, tasks: Sequence[BenchmarkTask]
+    folder: Path,
+    world: BenchmarkWorld,
+    tasks: Sequence[BenchmarkTask],
+    *,
+    follow_links: bool = False,
 ) -> Predictions:
     """Find the predictions of a world's tasks below a folder.
+
+    Args:
+        folder: where they are, in a folder of the world's name.
+        world: the world.
+        tasks: its tasks.
+        follow_links: whether links may lead out of the folder.
 
     Raises:
         DataError: one is missing or is there twice, one is of no task, or numbers of draws differ.
     """
-    place, wanted = inside(folder, world.name), {task.id: task for task in tasks}
+    place = folder / world.name if follow_links else inside(folder, world.name)
+    wanted = {task.id: task for task in tasks}
     if not place.is_dir():
         raise DataError(
             f"{folder} holds no predictions of {world.name} (no folder {place}): add them, or name "
@@ -112,7 +123,7 @@ def find_predictions(
         if path.name.startswith("."):
             continue
         name, draw = _named(path, world.name, wanted)
-        if no_file := _no_file(folder, path):
+        if no_file := _no_file(folder, path, follow_links):
             faults.append(no_file)
             if name in wanted:
                 found.setdefault(name, {})[draw] = path  # it is not missing
@@ -129,15 +140,18 @@ def find_predictions(
     return Predictions(folder, world, wanted, files)
 
 
-def _no_file(folder: Path, path: Path) -> str:
+def _no_file(folder: Path, path: Path, follow_links: bool) -> str:
     """Why a prediction is no file of its own, nor a folder of such; empty if it is.
 
     What a link leads to may be another's prediction, and a pipe would be waited for without end.
     """
     try:
-        place = inside(folder, str(path.relative_to(folder)))
+        place = path if follow_links else inside(folder, str(path.relative_to(folder)))
         for each in pictures_in(path) if place.is_dir() else [path]:
-            regular_file(folder, str(each.relative_to(folder)))
+            if follow_links:
+                check_regular(each)
+            else:
+                regular_file(folder, str(each.relative_to(folder)))
     except (DataError, OSError) as error:
         return str(error)
     return ""

@@ -32,6 +32,7 @@ def score_predictions(
     data: str | Path | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
+    follow_links: bool = False,
     workers: int | None = None,
     progress: bool = True,
 ) -> dict[str, Summary]:
@@ -49,6 +50,8 @@ def score_predictions(
             ``TASKS-truth``, where it is simulated if it is missing.
         out: the folder to write to; ``scores/NAME`` of the folder of predictions by default.
         overwrite: replace results of other tasks.
+        follow_links: whether predictions may be links that lead out of their folder, so that they
+            may be another's.
         workers: processes that simulate, one per core by default.
         progress: show progress bars.
 
@@ -63,7 +66,10 @@ def score_predictions(
     if not folder.is_dir():
         raise DataError(f"there is no folder {folder}")
     entry, chosen = read_entry(folder), given.worlds(worlds)
-    found = [find_predictions(folder, world, given.of(world.name)) for world in chosen]
+    found = [
+        find_predictions(folder, world, given.of(world.name), follow_links=follow_links)
+        for world in chosen
+    ]
     for each in found:
         each.check()
     home = Path(out) if out else Path("scores", folder.resolve().name)

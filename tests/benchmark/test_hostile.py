@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import socket
 import struct
 import zipfile
 import zlib
@@ -211,6 +212,105 @@ def test_the_folder_itself_may_be_a_link(folder, tasks, tmp_path):
     (tmp_path / "linked").symlink_to(folder)
     (world,) = Tasks(tasks).worlds()
     find_predictions(tmp_path / "linked", world, Tasks(tasks).of("slide")).check()
+
+
+def a_socket(path, _):
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(path))
+
+
+def a_chain(path, other):
+    """Links within the entry, of which the last leads out."""
+    path.with_name(".one").symlink_to(other)
+    path.with_name(".two").symlink_to(".one")
+    path.symlink_to(".two")
+
+
+def an_open_file(path, _):
+    path.symlink_to("/proc/self/fd/0")
+
+
+def a_round_trip(path, other):
+    """A path that leaves the entry and comes back to another's file beside it."""
+    path.symlink_to(f"../../{other.parent.name}/{other.name}")
+
+
+def a_playlist(path, other):
+    path.with_suffix(".mp4").write_text(f"#EXTM3U\n#EXTINF:1,\n{other}\n#EXT-X-ENDLIST\n")
+
+
+def a_concatenation(path, other):
+    path.with_suffix(".mkv").write_text(f"ffconcat version 1.0\nfile {other}\n")
+
+
+OTHERS = [a_socket, a_chain, an_open_file, a_round_trip, a_playlist, a_concatenation]
+
+
+@pytest.mark.parametrize("make", OTHERS, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("place", ["a prediction", "a picture", "the card"])
+def test_nothing_else_is_read_in_the_place_of_a_file(place, make, folder, tasks, tmp_path):
+    theirs = tmp_path / "theirs" / "sound.npz"
+    theirs.parent.mkdir()
+    np.savez(theirs, video=GREY)
+    path = folder / f"{CLIP}.npz"
+    if place == "a picture":
+        WRITERS["png"](folder / CLIP, GREY)
+        path = folder / CLIP / "9.png"
+    elif place == "the card":
+        np.savez(path, video=GREY)
+        path = folder / "entry.yaml"
+    make(path, theirs)
+    if place == "the card" and path.suffix == ".yaml" and not os.path.lexists(path):
+        return  # a video beside it is no card
+    said = sentence("score", folder, "--tasks", tasks)
+    assert ("entry.yaml" if place == "the card" else "ood_test-000002") in said
+
+
+@pytest.mark.parametrize("make", [a_link, a_pipe, a_device, a_socket], ids=lambda m: m.__name__)
+def test_the_folder_of_a_world_is_its_own(make, folder, tasks, tmp_path):
+    np.savez(folder / f"{CLIP}.npz", video=GREY)
+    theirs = (folder / "slide").rename(tmp_path / "theirs")
+    make(folder / "slide", theirs)
+    assert "slide" in sentence("score", folder, "--tasks", tasks)
+
+
+def test_links_within_an_entry_are_its_own(folder, tasks, tmp_path):
+    """A file, a picture, a folder of pictures, and the folder of a world."""
+    (world,) = Tasks(tasks).worlds()
+    given = Tasks(tasks).of("slide")
+    np.savez(folder / f"{CLIP}.npz", video=GREY)
+    (folder / "kept").mkdir()
+    (folder / f"{CLIP}.npz").rename(folder / "kept" / "clip.npz")
+    (folder / f"{CLIP}.npz").symlink_to("../kept/clip.npz")
+    find_predictions(folder, world, given).check()
+    (folder / f"{CLIP}.npz").unlink()
+    WRITERS["png"](folder / "kept" / "pictures", GREY)
+    (folder / CLIP).symlink_to("../kept/pictures")
+    found = find_predictions(folder, world, given)
+    found.check()
+    assert len(found.checksum) == 64
+    (folder / "slide").rename(folder / "elsewhere")
+    (folder / "slide").symlink_to("elsewhere")
+    find_predictions(folder, world, given).check()
+
+
+def test_predictions_on_other_disks_are_asked_for(folder, tasks, tmp_path):
+    (world,) = Tasks(tasks).worlds()
+    given, away = Tasks(tasks).of("slide"), tmp_path / "disk"
+    away.mkdir()
+    np.savez(away / "clip.npz", video=GREY)
+    (folder / f"{CLIP}.npz").symlink_to(away / "clip.npz")
+    found = find_predictions(folder, world, given, follow_links=True)
+    np.testing.assert_array_equal(found.video(CLIP), GREY)
+    (folder / "slide").rename(away / "slide")
+    (folder / "slide").symlink_to(away / "slide")
+    find_predictions(folder, world, given, follow_links=True).check()
+    for make in (a_pipe, a_device, a_socket, a_circle, a_broken_link):
+        path = away / f"{CLIP}.npz"
+        path.unlink()
+        make(path, None)
+        with pytest.raises(DataError, match="ood_test-000002"):
+            find_predictions(folder, world, given, follow_links=True)
 
 
 def laughs(levels=12):
