@@ -13,8 +13,8 @@ from acwm_core.evaluation.metric import Prediction
 from acwm_metrics.physical import PhysicalMetric, physics_of, row_means, start_of, truth_of
 from acwm_metrics.presence import out_of_sight, seen_once
 from acwm_metrics.seen import (
-    both_lost,
     held_among_true,
+    lost_of_pair,
     lost_shapes,
     measured,
     share_found,
@@ -23,6 +23,14 @@ from acwm_metrics.seen import (
 LASTING = 3
 """Frames in a row for which solid bodies must overlap, so that it is not just an estimator error.
 For other violations, see `Constant.lasting` and `Physics.lasting`."""
+
+
+TOUCHING = 1e-9
+"""Depth in m up to which bodies touch, but for rounding."""
+
+
+MISSED = 0.1
+"""Share of the frames in which estimators may miss a body; what hides more is left unmeasured."""
 
 
 class Permanence(PhysicalMetric):
@@ -88,11 +96,11 @@ class Penetration(PhysicalMetric):
     They meet in the frames in which they overlap, or almost do: their distance is below what the
     estimator's error can make an overlap. If bodies never meet, nothing is measured. A body that is
     not found stays where it was last seen, so others may run into it; if neither of two is found,
-    so may each by its true motion.
+    so may each by its true motion. That a body is not run into counts only if it is found.
     """
 
     name = "penetration"
-    definition = 3
+    definition = 4
     unit = "m"
 
     def lacking(self, physics: Physics) -> str | None:
@@ -113,14 +121,21 @@ class Penetration(PhysicalMetric):
 
 
 def _depth(gap: Gap, prediction: Prediction) -> NDArray[np.float64]:
-    """By how much two bodies overlap in each frame, `[T]`; negative is their distance."""
+    """By how much two bodies overlap in each frame, `[T]`; negative is their distance.
+
+    NaN where nothing overlaps and one of them is not found; if that is so in more than `MISSED` of
+    the frames, wherever nothing overlaps.
+    """
     depth = -measured(gap, prediction, held=True)
-    lost = both_lost(prediction, gap.pair)
-    if not lost.any():
-        return depth
-    start = start_of(prediction)
-    either = [-gap.measure(held_among_true(prediction, name), start) for name in gap.pair]
-    return np.where(lost, np.fmax(*either), depth)
+    lost = lost_of_pair(prediction, gap.pair)
+    if lost.all(1).any():
+        start = start_of(prediction)
+        either = [-gap.measure(held_among_true(prediction, name), start) for name in gap.pair]
+        depth = np.where(lost.all(1), np.fmax(*either), depth)
+    unsure = lost.any(1)
+    if unsure.mean() > MISSED:
+        unsure[:] = True
+    return np.where(unsure & (depth <= TOUCHING), np.nan, depth)
 
 
 class Violations(PhysicalMetric):

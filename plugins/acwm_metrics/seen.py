@@ -133,14 +133,14 @@ def _lost(prediction: Prediction, reading: Reading) -> Mask:
     return lost
 
 
-def both_lost(prediction: Prediction, pair: Sequence[str]) -> Mask:
-    """Whether neither of two bodies is found in a frame, `[T]`."""
+def lost_of_pair(prediction: Prediction, pair: Sequence[str]) -> Mask:
+    """Whether each of two bodies is lost, see `lost_bodies`, `[T, 2]`."""
     lost = {name: np.zeros(len(prediction.masks), np.bool_) for name in pair}
     for reading in physics_of(prediction).readings:
         for name, each in zip(reading.instances, lost_bodies(prediction, reading).T, strict=True):
             if name in lost:
                 lost[name] |= each
-    return np.logical_and.reduce(list(lost.values()))
+    return np.stack([lost[name] for name in pair], 1)
 
 
 def last_seen(

@@ -243,8 +243,41 @@ def test_bodies_that_both_vanish_are_run_into_by_each_others_true_motion():
 
     assert depth(FRAMES) == pytest.approx(0, abs=1e-9)
     # b stays at 0.5 m, and a moves on through this place in steps of 0.1 m
-    assert depth(2) == pytest.approx(np.mean([0, 0.1, 0.2, 0.1, 0]))
-    assert depth(2, 4) == pytest.approx(0, abs=1e-9)  # both are found again when they meet
+    assert depth(2) == pytest.approx(np.mean([0.1, 0.2, 0.1]))  # touching alone counts for nothing
+    assert depth(2, 3) == pytest.approx(0, abs=1e-9)  # both are found again when they meet
+
+
+STOPS = np.minimum(np.linspace(0, 0.9, FRAMES), 0.3)
+"""The true motion of a, which stops at b, a wall at 0.5 m."""
+
+
+@pytest.mark.parametrize("bodies", [[0, 1], [0], [1]], ids=["both", "a", "b"])
+@pytest.mark.parametrize("hidden", ["early", "from the start", "where they overlap", "in turn"])
+def test_vanishing_is_never_scored_as_no_overlap(hidden, bodies):
+    """A prediction in which a runs through b; what it hides makes it no better than it is."""
+    places = np.stack([STOPS, np.full(FRAMES, 0.5)], 1)[..., None]
+    gap = Gap(
+        "pair", ("a", "b"), lambda seen, start: 0.2 - overlap(seen.states["place"]), solid=0.05
+    )
+    physics = Physics((Reading("place", "position", ("a", "b")),), gaps=(gap,))
+    read = places.copy()
+    read[:, 0, 0] = np.linspace(0, 0.9, FRAMES)
+
+    def value(read):
+        return Penetration().value(
+            clip(physics, true=TRUE, states={"place": places}, read={"place": read}, names="ab")
+        )
+
+    visible = value(read)
+    assert visible > 0.05
+    frames = {
+        "early": slice(2, None),
+        "from the start": slice(1, None),
+        "where they overlap": slice(4, 9),
+        "in turn": slice(5, None, 2),
+    }[hidden]
+    read[frames, bodies] = np.nan
+    assert not value(read) < 0.9 * visible  # it is NaN if nothing is left to measure
 
 
 def overlap(places):
