@@ -175,7 +175,7 @@ def check_agreement(
         if says in LENGTHS:  # in any order
             alike = sorted(b - a for a, b in own) == sorted(b - a for a, b in edges)
         if not alike:
-            first, others = (", ".join(str(s) for s, _ in each[:4]) for each in (own, edges))
+            first, others = (", ".join(str(s) for s, _ in bounds[:4]) for bounds in (own, edges))
             raise DataError(
                 f"{where} contradicts itself: by {name}, episodes begin in rows {first}, and by "
                 f"the other arrays in rows {others}: remove what is wrong"

@@ -234,7 +234,7 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
     Raises:
         DataError: arrays contradict each other.
     """
-    found: Bounds | None = None
+    bounds: Bounds | None = None
     for place in (group, group.parent, group.file) if alone else (group,):
         parts = {"": place} | {name: place.get(name) for name in (place if alone else INDEX)}
         for prefix, part in parts.items():
@@ -253,11 +253,11 @@ def bounds_in(group: Any, count: int, *, alone: bool = True) -> Bounds | None:
                 if (values := np.asarray(value)).ndim in (1, 2) and may_tell(name, values, count)
             }
             where = f"{group.file.filename} ({', '.join(arrays)})"
-            if found:
-                check_agreement(arrays, found, count, where, flags=alone)
+            if bounds:
+                check_agreement(arrays, bounds, count, where, flags=alone)
             elif arrays:
-                found = bounds_of(arrays, count, where, flags=alone)
-    return found
+                bounds = bounds_of(arrays, count, where, flags=alone)
+    return bounds
 
 
 def _qualified(group: str, name: str) -> str:

@@ -168,9 +168,9 @@ class ActionReader:
         )
 
 
-def explained(wanted: Floats, found: Floats, variance: Floats) -> Floats:
+def explained(wanted: Floats, read: Floats, variance: Floats) -> Floats:
     """R² of each dimension of actions `[N, A]`, whose `variance` is NaN if it never changes."""
-    shares = 1 - ((wanted - found) ** 2).mean(0) / np.maximum(variance, 1e-12)
+    shares = 1 - ((wanted - read) ** 2).mean(0) / np.maximum(variance, 1e-12)
     return shares.astype(np.float32)
 
 

@@ -78,8 +78,8 @@ class PolicyInputs:
         """
         if self.picture:
             mean, (std,), (change,) = torch.tensor(self.mean), self.std, self.change
-            shown = [(now - mean) / std, (now.float() - before) / change]
-            return torch.cat([*shown, *([(goals - mean) / std] if self.aims else [])], 1)
+            pictures = [(now - mean) / std, (now.float() - before) / change]
+            return torch.cat([*pictures, *([(goals - mean) / std] if self.aims else [])], 1)
         mean, std, change = (
             torch.tensor(row, dtype=torch.float64) for row in (self.mean, self.std, self.change)
         )
