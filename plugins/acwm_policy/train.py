@@ -279,7 +279,7 @@ class _Keeper:
         errors = [row[COLUMNS.index("error")] for row in self._rows]
         self._rows.append([self._learner.steps, *values, round(self._seconds, 1)])
         if score.get("error", 0.0) <= min((e for e in errors if e is not None), default=math.inf):
-            self._policy().save(self._out)  # few recordings are soon learnt by heart
+            self._policy().save(self._out)  # few recordings are soon overfitted
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self._rows])
         with written_whole(self._out / CURVE) as partial:

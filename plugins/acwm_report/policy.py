@@ -242,5 +242,5 @@ def evaluate(folder: Path, **options: Any) -> None:
         click.echo(f"gap (dream − simulator): {gap_text(results['gap'])}")
         if results["dream_alone"]:
             seeds = ", ".join(map(str, results["dream_alone"]))
-            click.echo(f"solved in the dream alone: episodes {seeds}; collect more that begin so")
+            click.echo(f"solved in the dream alone: episodes {seeds}; collect more like them")
     click.echo(where / PAGE_FILE)
