@@ -281,7 +281,7 @@ def alone(path: Path, *, wait: bool = True) -> Generator[bool]:
 
 @contextlib.contextmanager
 def _locked(path: Path, seconds: float) -> Generator[bool]:
-    """Lock a file, waiting for so many seconds (-1: for ever); yields whether it is locked."""
+    """Lock a file, waiting up to `seconds` (-1: for ever); yields whether it is locked."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, timeout=seconds)

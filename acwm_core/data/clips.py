@@ -195,7 +195,7 @@ def take_fraction(episodes: Sequence[int], fraction: float) -> Sequence[int]:
     """A fixed subset of `episodes`, in order: at least one, and nested for growing `fraction`.
 
     A fixed permutation selects them, independent of the training seed, because neighbouring
-    episodes in a dataset may be alike.
+    episodes in a dataset may be similar.
     """
     if fraction == 1:
         return episodes

@@ -62,7 +62,7 @@ def join(
 
 
 def moments(frames: int, most: int) -> list[int]:
-    """Numbers of at most so many evenly spaced frames of a video, from the first to the last."""
+    """Indices of at most `most` evenly spaced frames of a video, from the first to the last."""
     return np.linspace(0, frames - 1, min(frames, most)).round().astype(int).tolist()
 
 

@@ -180,7 +180,7 @@ class EnvironmentCard:
         )
 
     def contradictions(self, other: EnvironmentCard) -> list[str]:
-        """What both cards say of the scene, and not alike, e.g. ``["camera", "state yaw"]``."""
+        """Declarations of the scene that differ, e.g. ``["camera", "state yaw"]``."""
         mine, theirs = self.completed_by(other), other.completed_by(self)
         differences = [name for name in SCENE if getattr(mine, name) != getattr(theirs, name)]
         pairs = zip(mine.state, theirs.state, strict=False)
@@ -190,7 +190,7 @@ class EnvironmentCard:
         """The values `[T, …]` of a state field after a symmetry: as that says, or as the kind does.
 
         Raises:
-            ShapeError: neither tells how the field is transformed.
+            ShapeError: neither says how the field is transformed.
         """
         if name in symmetry.states or name in symmetry.headings:
             return symmetry.of_states(name, values)

@@ -30,7 +30,7 @@ def checked_seed(seed: object) -> int | None:
     """The seed of one environment as a Python integer; NumPy's integers are taken, too.
 
     Raises:
-        ShapeError: it is no whole number of 0 or more.
+        ShapeError: it is not a whole number of 0 or more.
     """
     if seed is None:
         return None
@@ -185,7 +185,7 @@ class Environment(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]], ABC):
         Raises:
             RecipeError: unknown split or factor, an impossible factor value, no perturbed or no
                 transformed start.
-            ShapeError: the seed is no whole number of 0 or more.
+            ShapeError: the seed is not a whole number of 0 or more.
             AcwmError: an environment was drawn by OpenGL before this process was forked.
         """
         check_process(_drawn_in)

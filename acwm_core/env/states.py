@@ -117,7 +117,7 @@ def transform(field: StateField, values: Array, symmetry: Symmetry, camera: Came
         camera: its camera.
 
     Raises:
-        ShapeError: the card does not tell how it is transformed: the field has values, angles
+        ShapeError: the card does not say how it is transformed: the field has values, angles
             without an axis, or there is no camera.
     """
     given: Any = values

@@ -22,7 +22,7 @@ class Symmetry:
     """A transformation of frames and actions under which the environment stays the same.
 
     From a transformed start, transformed actions lead to the transformed video. Light and floor
-    need not follow: what is alike is where everything is.
+    need not follow: only where everything is must match.
 
     Attributes:
         actions: how it transforms an action.

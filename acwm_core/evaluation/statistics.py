@@ -1,6 +1,6 @@
 """The one significance test that acwm uses: a studentised bootstrap over episodes.
 
-Episodes are resampled, not clips, since clips of one episode are alike. Each episode contributes
+Episodes are resampled, not clips, since clips of one episode are similar. Each episode contributes
 one number, and each resample's mean is measured in its own standard errors (bootstrap-t with
 symmetric intervals, Hall 1988). With 8 to 20 episodes and no true effect, the plain percentile
 bootstrap finds 6 to 17 % significant at the 5 % level, depending on the distribution. This one

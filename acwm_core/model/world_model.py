@@ -152,7 +152,7 @@ class WorldModel(nn.Module):
         return nn.functional.pad(means, (1, 0), value=1)
 
     def condition(self, actions: Actions, latent_frames: int) -> Conditioning:
-        """The embedded raw actions `[B, T, A]` of clips of so many latent frames."""
+        """The embedded raw actions `[B, T, A]` of clips with `latent_frames` latent frames."""
         rows = self._prepare(actions, latent_frames)
         return self.conditioner.condition(rows, latent_frames, self.model.width)
 

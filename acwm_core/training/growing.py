@@ -27,7 +27,7 @@ class GrowingClipData(ClipData):
 
     The first episodes are held out, not the last, so that they stay the same. Checkpoints hold the
     passes, so a resumed run repeats those that it has begun with the same clips. Two runs see the
-    same passes only if the data grows alike.
+    same passes only if the data grows in the same way.
     """
 
     def _divided(self) -> tuple[Sequence[int], range]:

@@ -126,7 +126,7 @@ class MetricsFile(Logger):
 
     def _add_columns(self, row: Iterable[str]) -> None:
         """Write the file again, row by row, with columns for all of `row`."""
-        is_first = not self._columns  # what is there is of an earlier process
+        is_first = not self._columns  # an earlier process wrote what the file has
         old = self._path if self._path.exists() else Path(os.devnull)
         with old.open(newline="") as before, written_whole(self._path) as partial:
             rows = csv.DictReader(before)

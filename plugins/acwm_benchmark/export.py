@@ -85,7 +85,7 @@ def export_tasks(
         size: frame size of simulated data; by default the environment's.
         episodes: number of episodes of each test split, or `ALL`; by default the protocol's, or
             else `USUAL_EPISODES`.
-        seed: seed of simulated data. It is told to participants only if it is `PUBLIC`.
+        seed: seed of simulated data. Participants learn it only if it is `PUBLIC`.
         overrides: settings of the evaluation, such as ``evaluation.context_frames=5``.
         workers: processes that simulate, one per core by default.
         progress: show a progress bar.

@@ -151,7 +151,7 @@ class LossyVideo:
     def _quality_of(self, sample: LossyClip, encoder: Encoder, near: int) -> int:
         """The lowest quality at which the sample is still as large as its file.
 
-        The search widens from `near`, because files of one encoder are alike.
+        The search widens from `near`, because files of one encoder are similar.
         """
         frames = (sample.video * 255).round().astype(np.uint8)
 

@@ -21,7 +21,7 @@ from acwm_core.errors import DataError, suggest
 from acwm_core.files import check_regular, inside, regular_file
 
 TOLD = 5
-"""How many faults are told in one error."""
+"""Largest number of faults that one error lists."""
 
 _DRAW = re.compile(r"(.+)\.(\d+)")
 

@@ -24,7 +24,7 @@ from acwm_formats.timeline import Recordings
 Parts = Mapping[Split, tuple[Recordings, Sequence[int]]]
 """The recordings of each split, and the places in them of those that belong to it."""
 
-SAMPLED = 64  # recordings whose video is looked at
+SAMPLED = 64  # recordings whose video is examined
 
 
 def action_rate(

@@ -195,7 +195,7 @@ def _claimed(
 
 
 def _sound(aligned: Aligned, what: str, stream: _Samples) -> _Samples:
-    """The stream without samples whose times are none, stand still or go back, which are told."""
+    """The stream without samples whose times are missing or do not increase; notes report them."""
     kept, problems = faults(stream.times)
     for problem in problems:
         aligned.add_defect(f"{what}: {problem}")

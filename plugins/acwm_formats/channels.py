@@ -1,7 +1,7 @@
 """What the channels of frames in arrays are: colours, opacity, or grey frames of several moments.
 
 Agents of video games see the last three or four grey frames at once, stacked as channels. An array
-does not say so, but a stack tells it by its content: each frame repeats those before it.
+does not say so, but the content of a stack shows it: each frame repeats those before it.
 """
 
 from __future__ import annotations

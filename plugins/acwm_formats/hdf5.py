@@ -265,7 +265,7 @@ def _contents(
         known |= {identity(file[name]) for name in names}
         groups: dict[str, list[StoredEpisode]] = {}
         for name in names:
-            alone = len(names) == 1 and not layout.is_robosuite  # whose flags tell of success
+            alone = len(names) == 1 and not layout.is_robosuite  # whose flags mean success
             arrays = HDF5Group(path, name, within)
             groups[name] = [*_episodes(arrays, file[name], layout, alone=alone)]
         if layout.is_robosuite and names:  # opening one will tell what it lacks

@@ -24,7 +24,7 @@ from acwm_formats.survey.action_rate import ActionRate
 from acwm_formats.timeline import RecordedDataset
 
 UNSEEN = "Recorded: without instance masks (all zero) and contacts (none)."
-MOST_TOLD = 50  # notes and defects that are told one by one
+MOST_TOLD = 50  # notes and defects that are listed one by one
 
 
 def recorded_card(
@@ -217,7 +217,7 @@ def _rows(kept: Sequence[Scan]) -> NDArray[np.float32]:
 
 
 def _notes_by_recording(notes: Sequence[tuple[str, str]]) -> list[str]:
-    """Notes with the names of their recordings; what is said of many is said once."""
+    """Notes with the names of their recordings; a note that many share is given once."""
     names: dict[str, list[str]] = {}
     for name, note in notes:
         names.setdefault(note, []).append(name)

@@ -180,7 +180,7 @@ class LeRobotRecordings:
 
 @dataclass(frozen=True)
 class _Cameras(Mapping[str, Frames]):
-    """The frames of each camera; a video is looked at, and fetched, only if it is asked for."""
+    """The frames of each camera; a video is fetched and opened only if it is needed."""
 
     names: tuple[str, ...]
     index: int

@@ -195,7 +195,7 @@ class NumberMessages:
         return self.name.partition(":")[0]
 
     def add(self, entry: LoggedMessage) -> None:
-        """Add the numbers of a message; what is wrong with it is told by `numbers`."""
+        """Add the numbers of a message; `numbers` reports what is wrong with it."""
         if self.problem is None:
             try:
                 self._add(entry)

@@ -56,7 +56,7 @@ def check_packed(data: bytes | memoryview, codec: str = "", most: int | None = N
     except _DAMAGED:
         if codec:
             raise
-        return  # other bytes that begin alike, or damage, which whoever reads them reports
+        return  # other bytes with the same beginning, or damage, which their reader reports
     check_unpacked(len(data), size)
     if most is not None and size > most:
         raise ValueError(f"{len(data):,} bytes unpack to more than the {most:,} that belong there")

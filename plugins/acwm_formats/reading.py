@@ -1,4 +1,4 @@
-"""How all recordings of a dataset are read alike: cameras, sizes, states, alignment, and checks."""
+"""Reads all recordings of a dataset: cameras, sizes, states, alignment, and checks."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ from acwm_formats.reading import (
 from acwm_formats.staging import ORDER, STAGING, Staged, StagedEpisodes, StageTask, stage
 from acwm_formats.timeline import RecordedDataset, Recordings, TimedRecording
 
-ROWS = 1_000_000  # about how many rows of actions are looked at for their bounds
+ROWS = 1_000_000  # approximate number of rows of actions that determine the bounds
 AT_ONCE = 64  # recordings that one task looks at
 MOST_TOGETHER = 16  # recordings that one task decodes, if there are thousands
 
@@ -56,7 +56,7 @@ def import_dataset(
 ) -> DatasetCard:
     """Write recordings as the data folder `out`.
 
-    All recordings are looked at and decoded before anything is refused, so that all defects are in
+    All recordings are examined and decoded before anything is refused, so that all defects are in
     one list; those that are known without decoding are reported at once, too. What was decoded is
     kept, so the same call goes on where a killed one ended, and so does one with other options or
     after a file was removed.

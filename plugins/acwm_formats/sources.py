@@ -93,7 +93,7 @@ def fetched(url: str, *, progress: bool = True) -> Path:
         MissingExtraError: the package for this kind of URL is not installed.
     """
     url = url.rstrip("/")
-    if url.startswith("file://"):  # whose links are looked at where it is
+    if url.startswith("file://"):  # its links are checked in place
         return Path(unquote(urlsplit(url).path))
     marks = _listed(url)
     digest = hashlib.sha256(json.dumps([url, sorted(marks.items())]).encode()).hexdigest()[:16]
@@ -197,7 +197,7 @@ def _listed(url: str) -> Marks:
 
 
 def _found(system: Any, root: str, is_web: bool) -> dict[str, Any]:
-    """What the file system tells of each file."""
+    """The status of each file, by the file system."""
     if is_web and system.info(root).get("mimetype") != "text/html":
         return {root: system.info(root)}
     files = system.find(root, detail=True)

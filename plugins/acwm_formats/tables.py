@@ -219,7 +219,7 @@ def _numbered(rows: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
 
 
 def seconds(table: Table, name: str, path: Path) -> NDArray[np.float64]:
-    """A column of times in seconds; its unit is told by the end of its name, as in ``time_ms``.
+    """A column of times in seconds; the end of its name gives the unit, as in ``time_ms``.
 
     Raises:
         DataError: it is missing, or holds something else than finite numbers.

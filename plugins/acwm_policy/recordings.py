@@ -22,10 +22,10 @@ PICTURES = ["pictures"]
 """What `PolicySettings.observe` is for pictures in place of states."""
 
 HELD_OUT = 10
-"""One of so many training episodes is kept for measuring errors, if there is no split for it."""
+"""Every tenth training episode is held out to measure errors, if there is no test split."""
 
 MOST_PICTURES = 2000
-"""About as many moments with pictures are looked at to measure an error."""
+"""Approximate number of moments with pictures on which an error is measured."""
 
 
 class Recorded(NamedTuple):
@@ -33,7 +33,7 @@ class Recorded(NamedTuple):
 
     Attributes:
         states: what is observed of the state, `[T, S]`, or of the pictures; see `PolicyInputs`.
-        goals: what would be the goal if the episode were to lead to a frame, `[T, G]`.
+        goals: the goal that each frame would be, `[T, G]`.
         actions: scaled to [-1, 1], `[T, A]`; row t leads from frame t to t + 1.
     """
 
@@ -52,7 +52,7 @@ class Decisions(NamedTuple):
 class Recordings:
     """Recorded episodes to imitate.
 
-    What an episode was to lead to is not recorded. Wherever it came later is taken for its goal
+    The goal of an episode is not recorded, so any later state of it is taken as its goal
     (hindsight; Ghosh et al. 2021, arXiv 1912.06088).
 
     Args:
@@ -96,7 +96,7 @@ class Recordings:
         self._error: float | None = None
 
     def draw(self, number: int, random: torch.Generator) -> Decisions:
-        """So many moments, of all frames alike."""
+        """A number of moments, drawn uniformly from all frames."""
         places = torch.randint(len(self._learnt), (number,), generator=random)
         return self._decisions(self._learnt, places, random)
 

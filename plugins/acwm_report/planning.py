@@ -234,9 +234,7 @@ def draw_landscapes(
                     path = draw(costs, player.card.action, out / f"landscape-{seed:04d}.png")
                     ranks = costs.ranks.items()
                     shares = ", ".join(f"{rank:.1%} in the {judge}" for judge, rank in ranks)
-                    messages.append(
-                        f"{path}: cheaper than the true action: {shares}"
-                    )
+                    messages.append(f"{path}: cheaper than the true action: {shares}")
                 advance(1)
         if left.error and not messages:
             raise left.error

@@ -177,7 +177,7 @@ def _shortened(stretch: Moments) -> Moments:
 
 
 def _shares(parts: Sequence[Numbers]) -> Numbers:
-    """What each group's frames tell of each of `parts`, ``[part, group]``, at its best shift.
+    """How well each group's frames predict each of `parts`, ``[part, group]``, at its best shift.
 
     Args:
         parts: of each ``[shift, action, group]``.

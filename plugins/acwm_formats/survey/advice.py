@@ -22,7 +22,7 @@ APART = 0.15  # from which all episodes look different at rest: 0.11 of hills, 0
 MOVES = 0.002  # share of the picture from which something moves: at least 0.004 of a small ball
 EPISODES = 100  # recordings from which points are known to learn how actions move them
 
-STRETCHES = 24  # that are looked at before a training begins
+STRETCHES = 24  # examined before a training begins
 
 
 def advice_for(path: Path) -> Advice | None:

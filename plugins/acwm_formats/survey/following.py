@@ -1,10 +1,10 @@
 """Whether a video follows its actions, and with what delay.
 
 Actions are read from the changes of frames by ridge regression, in episodes that the regression has
-not seen. Since actions are alike from one frame to the next, and a policy answers what it sees, a
-change also tells of actions before and after the one that made it. What settles the delay is what
-nobody could have known before: the part of an action that earlier actions and earlier frames do not
-foretell. The first change that tells of it is the one that the action made.
+not seen. Since consecutive actions are similar, and a policy responds to what it sees, a change
+also carries information about actions before and after the one that caused it. The delay is
+therefore measured on the part of an action that earlier actions and earlier frames do not predict.
+The first change that carries information about this part is the one that the action caused.
 
 Each reading is compared with one from another episode's frames at the same time. Episodes whose
 actions were exchanged, or that all do the same at the same time, therefore show nothing.
@@ -206,11 +206,11 @@ def _shown(values: Numbers) -> bool:
 
 
 def _delay(explained: Numbers, shifts: Sequence[int]) -> tuple[int | None, float]:
-    """The first change that notably tells of an action, in most resamples, and their share.
+    """The first change that notably predicts an action, in most resamples, and their share.
 
-    It begins the run of such changes that holds the most telling one: the frames that a policy
-    answers tell of its actions, too, but apart from what the actions do. What is merely likely
-    counts as well, so a delay is uncertain if an earlier change may tell something, too.
+    It begins the run of such changes that contains the best predictor: the frames to which a policy
+    responds predict its actions, too, but are not caused by them. What is merely likely counts as
+    well, so a delay is uncertain if an earlier change may also be a predictor.
     """
     early = [shift < 0 for shift in shifts]
     above = explained - np.median(explained[early], 0)  # what the regression finds in nothing

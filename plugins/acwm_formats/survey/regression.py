@@ -1,4 +1,4 @@
-"""Ridge regression across episodes: what some numbers tell of others in episodes not seen."""
+"""Ridge regression across episodes: how well some numbers predict others in held-out episodes."""
 
 from __future__ import annotations
 
