@@ -26,6 +26,9 @@ UNITS = 4.0
 STEP = 0.3
 """Scale of a change in a latent frame."""
 
+LIMIT = 1.2
+"""Largest number of a point; what is read lies from −1 to 1."""
+
 
 class Points(NamedTuple):
     """The state of points in a latent frame.
@@ -51,6 +54,14 @@ class Points(NamedTuple):
     pushed: Tensor
     memory: Tensor
     chance: tuple[Tensor, ...] = ()
+
+
+def bounded(points: Tensor) -> Tensor:
+    """Points within `LIMIT`, with slopes as if they were not.
+
+    Without it, errors that push one another grow without end in long windows, and training fails.
+    """
+    return points + (points.clamp(-LIMIT, LIMIT) - points).detach()
 
 
 class PointMotion(nn.Module):
@@ -147,13 +158,13 @@ class PointMotion(nn.Module):
         faster, further = (STEP * self.accelerate(torch.cat(inputs, 1))).chunk(2, 1)
         phases = state.phases + state.rates + further
         push, memory = self._pushed(state.points, state.memory, action)
-        pushed = state.pushed + STEP * push
-        led = self._led(phases, state.scene) - state.led
+        led = state.given + self._led(phases, state.scene) - state.led
+        points = bounded(led + state.pushed + STEP * push)
         return state._replace(
-            points=state.given + led + pushed,
+            points=points,
             phases=phases,
             rates=state.rates + faster,
-            pushed=pushed,
+            pushed=points - led,
             memory=memory,
         )
 
