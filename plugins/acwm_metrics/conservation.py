@@ -132,9 +132,7 @@ def _depth(gap: Gap, prediction: Prediction) -> NDArray[np.float64]:
         start = start_of(prediction)
         either = [-gap.measure(held_among_true(prediction, name), start) for name in gap.pair]
         depth = np.where(lost.all(1), np.fmax(*either), depth)
-    unsure = lost.any(1)
-    if unsure.mean() > MISSED:
-        unsure[:] = True
+    unsure = lost.any(1) | (lost.any(1).mean() > MISSED)
     return np.where(unsure & (depth <= TOUCHING), np.nan, depth)
 
 

@@ -54,13 +54,19 @@ def smooth(rng, times, memory):
     return np.array(rows)
 
 
-def path(kind, times, actions, frames):
+def path(kind, times, actions, frames, late=0.0):
     """Where the spot is at each frame, ``[frames, 2]`` in pixels from where it began."""
     step = 1 / FPS / FINE
     instants = np.arange(frames * FINE) * step
     latest = np.searchsorted(times, instants + 1e-9, side="right") - 1
     now = np.where(latest[:, None] >= 0, actions[latest], 0)
-    if kind == "absolute":
+    if kind == "absolute" and late:  # what is left of the way halves and halves again
+        place, places = 4 * now[0], []
+        for target in now:
+            places.append(place)
+            place = place + step / late * (4 * target - place)
+        found = np.array(places)
+    elif kind == "absolute":
         found = 4 * now
     elif kind == "velocity":
         found = 12 * step * np.concatenate([np.zeros((1, 2)), now.cumsum(0)[:-1]])
@@ -78,12 +84,15 @@ def path(kind, times, actions, frames):
     return found[::FINE]
 
 
-def spot(seed, kind, per_frame, rhythm="even", *, memory=0.1, frames=48):
-    """An episode of a kind of actions, so many of them per frame."""
+def spot(seed, kind, per_frame, rhythm="even", *, memory=0.1, frames=48, late=0.0):
+    """An episode of a kind of actions, so many of them per frame.
+
+    Targets are reached with a time constant of `late` seconds.
+    """
     rng = np.random.default_rng(seed)
     times = action_times(rng, per_frame * FPS, frames / FPS, rhythm)
     actions = smooth(rng, times, memory)
-    places = rng.uniform(12, 20, 2) + path(kind, times, actions, frames)
+    places = rng.uniform(12, 20, 2) + path(kind, times, actions, frames, late)
     down, right = np.mgrid[:SIDE, :SIDE]
     half = SIDE / 2
     apart = [

@@ -1,5 +1,7 @@
 """Actions that come more often than frames: summed right, told, and asked about."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -8,7 +10,7 @@ from acwm_core.cli import main
 from acwm_core.data.card import DatasetCard
 from acwm_core.data.video import write_mp4
 from acwm_formats.alignment import Alignment, align
-from acwm_formats.survey.action_rate import followed
+from acwm_formats.survey.action_rate import ActionRate, followed
 from acwm_formats.survey.following import Moments
 from acwm_formats.survey.motion import small
 from tests.formats.spots import FPS, spot
@@ -88,6 +90,47 @@ def test_the_video_tells_whether_it_follows_values_or_sums(kind, right):
 def test_forces_are_never_taken_for_targets():
     """Their value at a frame tells more of what is new than their sum, which acts later."""
     tell("torque", "sum", 4, "even", 0.4)
+
+
+LATE = [(10, "even", 0.1), (10, "irregular", 0.3), (5, "pairs", 0.8), (3, "irregular", 0.3)]
+
+
+@pytest.mark.parametrize(("rate", "rhythm", "late"), LATE)
+def test_targets_that_are_reached_late_are_never_taken_for_velocities(rate, rhythm, late):
+    """The video follows their mean over a frame, but moves back as other targets replace them."""
+    found, shares = followed(*pairs("absolute", rate, rhythm, memory=0.1, late=late))
+    assert found != "sum"
+    assert shares[1] > shares[0]  # the mean is read better than the value
+
+
+def test_velocities_as_fast_are_still_told():
+    assert followed(*pairs("velocity", 10, "irregular", memory=0.1))[0] == "sum"
+
+
+def mixed(rate):
+    """Stretches in which y is a target of the upper spot, and x a velocity of the lower one."""
+    upper, lower = (pairs(kind, rate, "even", memory=0.2) for kind in ("absolute", "velocity"))
+    return [
+        [joined(one, other) for one, other in zip(ours, others[1:] + others[:1], strict=True)]
+        for ours, others in zip(upper, lower, strict=True)
+    ]
+
+
+def joined(upper, lower):
+    """One stretch of two, one below the other, with an action of each."""
+    count = min(len(upper.actions), len(lower.actions))
+    frames = [each.frames[: count + 1] for each in (upper, lower)]
+    actions = [each.actions[:count, column] for column, each in enumerate((upper, lower))]
+    return replace(upper, frames=np.concatenate(frames, 2), actions=np.stack(actions, 1))
+
+
+def test_actions_of_several_kinds_are_told_apart():
+    follows, shares = followed(*mixed(5))
+    assert follows == "both"
+    rate = ActionRate((5.0, 5.0), 0.8, ("absolute",), False, follows, shares)
+    assert "a kind for each, in order" in rate.question
+    assert "--action-kind delta,delta,absolute" in rate.question
+    assert ActionRate.of_source(rate.to_source()) == rate
 
 
 @pytest.mark.slow

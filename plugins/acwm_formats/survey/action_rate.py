@@ -2,7 +2,9 @@
 
 Of several actions to a frame, targets such as positions act by their value at the frame, and
 velocities, forces and steps by their sum over the frame. Which of the two a source means is often
-nowhere in it, so it is found by what can be read from the changes of the video.
+nowhere in it, so it is found by what can be read from the changes of the video. A robot that
+reaches its targets late follows their mean, too, but what moved one way moves back, as the next
+target replaces the last; what a velocity, force or step has moved stays there.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from scipy import stats
 
 from acwm_formats.survey.following import BEFORE, CERTAIN, FEWEST, LEAST, Moments, Seen, varying
 from acwm_formats.survey.regression import Numbers
+from acwm_formats.survey.response import lasting
 
 SOURCE = "action_rate"
 """The key of the source in a dataset's card."""
@@ -24,8 +27,9 @@ SOURCE = "action_rate"
 SHIFTS = range(-2, 3)
 COUNTS = ("", "", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 ALSO = "--action-kind velocity, torque or delta"
+LASTS = 0.8  # share of a motion that stays; with targets at most 0.75, unless they take seconds
 
-Followed = Literal["value", "sum", ""]
+Followed = Literal["value", "sum", "both", ""]
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class ActionRate:
         kinds: what actions command, as the import took it; several if dimensions differ.
         stated: whether the user or the source says so. If not, they were held.
         follows: what the video follows if it is not stated: the value at a frame or the sum over
-            it; empty if that cannot be told.
+            it, or both if actions differ; empty if that cannot be told.
         told: the shares of the value (or of its change, if the video follows the value), and of
             the sum, that can be read from the frames.
     """
@@ -82,7 +86,15 @@ class ActionRate:
                 f"({value} of the change is read from the frames, {total} of the sum over a "
                 f"frame): give --action-kind absolute if they are targets; else {ALSO}"
             )
-        return f"velocities or forces? Import again with {ALSO}, or with absolute for targets"
+        if self.follows == "both":
+            return (
+                "the video follows the values of some and the sums over a frame of others: give a "
+                "kind for each, in order, such as --action-kind delta,delta,absolute"
+            )
+        return (
+            f"velocities or forces? The video does not tell: import again with {ALSO}, or with "
+            "absolute for targets, or with a kind for each, in order, such as delta,delta,absolute"
+        )
 
     @property
     def _fast(self) -> str:
@@ -123,7 +135,7 @@ class ActionRate:
                 float(known["unused"]),
                 tuple(map(str, known["kinds"])),
                 bool(known["stated"]),
-                cast(Followed, follows if follows in ("value", "sum") else ""),
+                cast(Followed, follows if follows in ("value", "sum", "both") else ""),
                 (value, total),
             )
         except (KeyError, TypeError, ValueError):
@@ -165,27 +177,36 @@ def followed(
         return "", (0.0, 0.0)
     seen = [Seen(side, varies, SHIFTS[-1]) for side in (held, summed, changes)]
     parts = [np.stack([side.moved(shift) for shift in SHIFTS]) for side in seen]
-    value, total, change = _shares(parts)
+    best = np.clip(np.max([part.mean(2).max(0) for part in parts], axis=0), 0, 1)
+    whole, shares = _verdict(seen[1], parts, best)
+    apart = {_verdict(seen[1], parts, best * one)[0] for one in np.eye(len(best))}
+    return "both" if {"value", "sum"} <= apart else whole, shares
+
+
+def _verdict(
+    summed: Seen, parts: Sequence[Numbers], weights: Numbers
+) -> tuple[Followed, tuple[float, float]]:
+    """What `followed` returns, of actions that count by `weights`.
+
+    Args:
+        summed: the stretches with the means until the next frame.
+        parts: how well value, sum and change are read, each ``[shift, action, group]``.
+    """
+    weights = weights / max(weights.sum(), 1e-12)
+    rows = [np.einsum("sag,a->sg", part, weights) for part in parts]
+    shifts = [int(row.mean(1).argmax()) for row in rows]
+    value, total, change = (row[shift] for row, shift in zip(rows, shifts, strict=True))
     if change.mean() > value.mean() and _exceeds(change, total):
         return "value", _percent(change, total)
-    return "sum" if _exceeds(total, value) else "", _percent(value, total)
+    if not _exceeds(total, value):
+        return "", _percent(value, total)
+    stays, error = lasting(summed, SHIFTS[shifts[1]], weights)
+    return "sum" if stays - 2 * error > LASTS else "", _percent(value, total)
 
 
 def _shortened(stretch: Moments) -> Moments:
     """A stretch without its last frame, before which no value changes."""
     return replace(stretch, frames=stretch.frames[:-1], actions=stretch.actions[:-1])
-
-
-def _shares(parts: Sequence[Numbers]) -> Numbers:
-    """How well each group's frames predict each of `parts`, ``[part, group]``, at its best shift.
-
-    Args:
-        parts: of each ``[shift, action, group]``.
-    """
-    best = np.clip(np.max([part.mean(2).max(0) for part in parts], axis=0), 0, 1)
-    weights = best / max(best.sum(), 1e-12)
-    rows = [np.einsum("sag,a->sg", part, weights) for part in parts]
-    return np.stack([row[int(row.mean(1).argmax())] for row in rows])
 
 
 def _percent(value: Numbers, total: Numbers) -> tuple[float, float]:
