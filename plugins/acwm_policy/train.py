@@ -130,9 +130,8 @@ def train_policy(
         "after": None if after is None else file_sha256(after / POLICY_FILE),
         "seed": seed,
         **asdict(settings),
+        **({"reward": asked.facts()} if isinstance(asked, RewardTask) else {}),
     }
-    if isinstance(asked, RewardTask):
-        about["reward"] = asked.facts()
     with _opened(out, about):
         use_threads(None, None, choose=True)
         bundle.world_model.to(choose_device(device))
