@@ -144,7 +144,7 @@ def align(recording: TimedRecording, cameras: Sequence[str], options: Alignment)
     aligned = Aligned(recording.name, notes=[*recording.notes])
     try:
         frames = {name: _frame_stream(aligned, name, recording.cameras[name]) for name in cameras}
-        main = _claimed(aligned, frames[cameras[0]], recording.length, options)
+        main = _claimed(aligned, frames[cameras[0]], recording, options)
         frames[cameras[0]] = main
         if len(main.times) < 2:
             aligned.add_defect(
@@ -184,11 +184,13 @@ def _frame_stream(aligned: Aligned, name: str, frames: Frames) -> _Samples:
 
 
 def _claimed(
-    aligned: Aligned, frames: _Samples, length: int | None, options: Alignment
+    aligned: Aligned, frames: _Samples, recording: TimedRecording, options: Alignment
 ) -> _Samples:
     """The frames without a few beyond those that the source claims: video files often end late."""
+    length, numbers = recording.length or 0, recording.actions.frames
     spare = len(frames.times) - length if length else 0
-    if not 0 < spare <= options.max_gap:
+    has_rows = numbers is not None and len(numbers) > 0 and np.max(numbers) >= length
+    if has_rows or not 0 < spare <= options.max_gap:
         return frames
     aligned.notes.append(f"its last {spare} frames, which have no row, were left out")
     return _Samples(frames.times[:length], frames.values[:length])
