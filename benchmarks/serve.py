@@ -45,12 +45,14 @@ class Load:
 
 
 def start_of(facts):
+    """A start of noise, as the server's facts ask for one."""
     size = (*facts["frame_size"], 3)
     shape = size if facts["given"] == 1 else (facts["given"], *size)
     return {"frames": np.random.randint(0, 256, shape, np.uint8)}
 
 
 def random_actions(facts):
+    """Actions of a latent frame, uniform within the bounds."""
     shape = (facts["stride"], len(facts["low"]))
     return np.random.uniform(facts["low"], facts["high"], shape).astype(np.float32)
 
@@ -93,6 +95,7 @@ async def watch(load: Load, until: float) -> None:
 
 
 def metrics(port: int) -> dict[str, float]:
+    """What `/metrics` reports, without histograms' buckets."""
     request = urllib.request.Request(
         f"http://127.0.0.1:{port}/metrics", headers={"Authorization": f"Bearer {TOKEN}"}
     )
@@ -103,6 +106,7 @@ def metrics(port: int) -> dict[str, float]:
 
 
 async def under_load(port: int, clients: int, seconds: float) -> Load:
+    """Many clients for some seconds."""
     load, until = Load(port), time.monotonic() + seconds
     await asyncio.gather(watch(load, until), *(drive(load, until) for _ in range(clients)))
     return load
@@ -123,6 +127,7 @@ def without_server(run: str, seconds: float) -> Load:
 
 
 def row(name: str, load: Load, seconds: float) -> list[str]:
+    """The cells of a load."""
     p50, p95 = np.percentile(load.latencies, [50, 95]) * 1000
     memory = [f"{load.memory[k]:.0f}" for k in (len(load.memory) // 4, -1)] if load.memory else []
     cells = [name, f"{p50:.0f}", f"{p95:.0f}", f"{load.frames / seconds:.1f}"]
@@ -130,6 +135,7 @@ def row(name: str, load: Load, seconds: float) -> list[str]:
 
 
 def main() -> None:
+    """Measure without a server, with one client and with many, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("run", help="run folder, or the name of a trained model")
     parser.add_argument("--clients", type=int, default=64)

@@ -3,19 +3,15 @@
     python benchmarks/sources.py recordings/fetch recordings/pong --out runs/sources
 
 Each folder is one of `render_sources.py`, or any other of videos with tables of actions. It is
-imported, and both models learn from it in about equal CPU time: points (`+points`) and the grid
-(`+recurrent`). The table has the PSNR of whole test episodes from their first frame, and by thirds;
-how much of it is lost with the actions of another episode; the energy of the pictures' slopes,
-relative to the truth; and CPU-minutes. Strips of frames are written beside the runs. What is there
-is not made again.
+imported, and both models learn from it: points (`+points`) and the grid (`+recurrent`). The table
+has the PSNR of whole test episodes from their first frame, and by thirds; the change of PSNR with
+the actions of another episode; the energy of the pictures' slopes, relative to the truth; and
+CPU-minutes. Strips of frames are written beside the runs. Existing results are not computed again.
 """
 
 from __future__ import annotations
 
 import json
-import resource
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +19,7 @@ from typing import Any
 import click
 import numpy as np
 import torch
+from first_table import ACWM, SETTINGS, run
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -30,11 +27,6 @@ import acwm
 from acwm_core.training.run import load_run
 from acwm_formats.survey.advice import advice_for
 
-ACWM = [sys.executable, "-m", "acwm_core.cli"]
-SETTINGS = (
-    "training.cpu_threads=1", "training.sample_every_n_steps=0", "data.validation_episodes=8",
-    "training.validate_every_n_steps=500",
-)  # fmt: skip
 MODELS = {
     "grid": ("+recurrent", "trainer.max_steps=500"),
     "points": (
@@ -80,14 +72,6 @@ def row_of(name: str, data: Path, out: Path, seed: int) -> dict[str, Any]:
         scores = scored(folder, acwm.EpisodeDataset(data, "ind_test"))
         result.write_text(json.dumps({**scores, "minutes": seconds / 60}))
     return json.loads(result.read_text())
-
-
-def run(command: list[str]) -> float:
-    """Run a command to its end; the CPU-seconds that it took."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 @torch.no_grad()
